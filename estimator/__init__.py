@@ -1,0 +1,1 @@
+"""The graph, its solvers, the drivers, the command line and the report."""

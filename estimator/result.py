@@ -1,0 +1,142 @@
+"""The answer: what the estimator hands to the report, the log and the JSON file. Frozen, in SI units.
+
+Covariances of poses are 6x6 in the ROS order: translation (x, y, z), then rotation about fixed axes (X, Y, Z) of
+the parent frame. Covariances of points in {b} come from the joint of `o_T_b` and the point.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors.measurements import Event, Rejection
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """`parent_T_name` with its covariance."""
+
+    name: str
+    parent: str
+    stamp_ns: int
+    matrix: Float
+    """Shape (4, 4)."""
+    covariance: Float | None
+    """Shape (6, 6), translation first, fixed axes of the parent, m and rad; None where it was not asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointEstimate:
+    """A pipe point in the robot's frame."""
+
+    id: str
+    role: str
+    frame: str
+    """`b`, or `b0`, `b1`, ... where the base was moved: the station that asked."""
+    position_m: Float
+    """Shape (3,)."""
+    covariance_m2: Float
+    """Shape (3, 3)."""
+    radius95_m: float
+    """Radius of the sphere about the position that holds the point with 95 %."""
+    measurements: int
+    axis: Float | None = None
+    """Shape (3,), direction of the pipe's axis at the point, where a pipe is known."""
+    pipe_id: str | None = None
+    budget: dict[str, Float] = field(default_factory=dict)
+    """Contribution of each source to `covariance_m2`, shape (3, 3) each; they sum to it exactly."""
+
+
+@dataclass(frozen=True, slots=True)
+class PipeEstimate:
+    """A pipe's cylinder in {b}."""
+
+    id: str
+    frame: str
+    point_m: Float
+    """Shape (3,), the point of the axis nearest to the picks."""
+    axis: Float
+    """Shape (3,), unit."""
+    radius_m: float
+    covariance: Float
+    """Shape (7, 7), of (point, axis, radius)."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationEstimate:
+    """One calibration state against its prior."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    prior: float
+    prior_sigma: float
+    frozen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FamilyConsistency:
+    """Chi-square of one factor family at the estimate, robust weights off, rejected measurements left out."""
+
+    family: str
+    chi2: float
+    dof: float
+    """Number of residuals less their share of the estimated parameters."""
+    lower: float
+    upper: float
+    """Acceptance limits of chi2 / dof."""
+    residuals: int
+    downweighted: int
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Does the model agree with its own data?"""
+
+    chi2: float
+    dof: float
+    by_family: tuple[FamilyConsistency, ...]
+    paths: dict[str, float]
+    """Disagreement of independent ways to the same quantity, in sigmas."""
+    passed: bool
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceEstimate:
+    """Distance between two marker points, given or asked for."""
+
+    name: str
+    distance_m: float
+    sigma_m: float
+    given_m: float | None = None
+    given_sigma_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Everything that was estimated from one recording."""
+
+    points: tuple[PointEstimate, ...]
+    poses: tuple[PoseEstimate, ...]
+    """`b`, boards, and the mobile camera at the last keyframe (`m`)."""
+    trajectory: tuple[PoseEstimate, ...]
+    """`o_T_m` at every processed frame; covariance at keyframes."""
+    pipes: tuple[PipeEstimate, ...]
+    calibration: tuple[CalibrationEstimate, ...]
+    distances: tuple[DistanceEstimate, ...]
+    consistency: Consistency
+    rejected: tuple[Rejection, ...]
+    events: tuple[Event, ...]
+    streaming_difference_sigma: dict[str, float]
+    """Largest difference between the iSAM2 and the batch estimate, in sigmas of the batch, by quantity."""
+    timing: dict[str, float]
+    provenance: dict[str, str]
+    """Versions, hashes, command."""
+    config_yaml: str
+    """The effective rig."""
+    last_board_view_ns: int | None
+    end_ns: int

@@ -1,0 +1,1 @@
+"""The synthetic robot cell: renders recordings with known truth, and the campaigns that use them."""
