@@ -79,7 +79,7 @@ class Kinect(Section):
 
 
 class Marker(Section):
-    """One marker on a page: its centre in the page frame (x right, y up), and its turn about the page normal."""
+    """One marker on a page: its centre in the page frame (x right, y up) and its turn about the normal."""
 
     id: Annotated[int, Field(ge=0)]
     centre_m: tuple[Finite, Finite]
@@ -183,7 +183,7 @@ class Cut(Section):
 
 
 class Pipe(Section):
-    """A pipe that the picks are on. `points` lists their ids; without any entry all cut and grasp picks share one."""
+    """A pipe that the picks are on. `points` lists their ids; none: all cut and grasp picks share the pipe."""
 
     id: str = "pipe0"
     points: tuple[str, ...] = ()
