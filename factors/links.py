@@ -53,5 +53,3 @@ def weak_pose_prior(key: int, pose: gtsam.Pose3, sigma_rad: float, sigma_m: floa
 def base_motion_factor(earlier: int, later: int, a_T_b: np.ndarray, covariance: np.ndarray) -> gtsam.NonlinearFactor:
     """The machine between two stations, `b[j]_T_b[j+1]`; covariance (6, 6) rotation first, body frame of the later."""
     return gtsam.BetweenFactorPose3(earlier, later, gtsam.Pose3(a_T_b), gaussian(covariance))
-
-

@@ -32,9 +32,7 @@ def line_planes(lines: Float, K: Float) -> tuple[Float, Float]:
     return normals / lengths[:, None], lengths
 
 
-def tangency(
-    lines: Float, K: Float, a: Float, b: Float, radius: float
-) -> tuple[Float, Float, Float]:
+def tangency(lines: Float, K: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
     """Both outline planes touch the cylinder: `n . p = radius` for the axis points p = a, b in the camera frame.
 
     Args:
@@ -152,7 +150,9 @@ def on_axis_factor(point: int, pipe: int) -> gtsam.CustomFactor:
     return gtsam.CustomFactor(sigmas([ON_AXIS_SIGMA_M] * 3), variables, error)
 
 
-def axis_gauge(key: int, point: Float, direction: Float, along_m: float = 1e-3, across_m: float = 10.0) -> gtsam.NonlinearFactor:
+def axis_gauge(
+    key: int, point: Float, direction: Float, along_m: float = 1e-3, across_m: float = 10.0
+) -> gtsam.NonlinearFactor:
     """Fixes where an axis point lies along the axis; across it says nothing (10 m)."""
     d = direction / np.linalg.norm(direction)
     along = np.outer(d, d)
