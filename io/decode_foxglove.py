@@ -110,7 +110,7 @@ def _protobuf_head(get: Get) -> Head:
 
 def _json_head(get: Get) -> Head:
     time = get("timestamp")
-    if not callable(time):
+    if not time:
         raise ValueError("no timestamp")
     parts: list[Any] = [time("sec"), time("nsec")]
     return int(parts[0]) * 1_000_000_000 + int(parts[1]), str(get("frame_id") or "")
@@ -172,17 +172,18 @@ def _pose(get: Get, _: str) -> Body:
 
 def _pose_or_none(get: Any) -> np.ndarray[Any, np.dtype[np.float64]] | None:
     """None where the message has no pose, or only its defaults."""
-    if not callable(get):
+    if not get:
         return None
-    p: Any = get("position")
-    q: Any = get("orientation")
-    translation = [float(p(axis)) for axis in "xyz"] if callable(p) else [0.0, 0.0, 0.0]
-    quaternion = [float(q(axis)) for axis in "xyzw"] if callable(q) else [0.0, 0.0, 0.0, 0.0]
+    translation, quaternion = _vector(get("position"), "xyz"), _vector(get("orientation"), "xyzw")
     if not any(quaternion):
         if not any(translation):
             return None
         quaternion = [0.0, 0.0, 0.0, 1.0]
     return pose_matrix(translation, quaternion)
+
+
+def _vector(get: Any, axes: str) -> list[float]:
+    return [float(get(axis)) for axis in axes] if get else [0.0] * len(axes)
 
 
 BODIES: dict[str, Callable[[Get, str], Body]] = {

@@ -63,13 +63,12 @@ class LogReader:
                 continue
             try:
                 yield decoder(data, log_time_ns)
-            except DecodeError as error:
+            except LogError as error:
+                # one bad message may stand among good ones; a bad calibration is bad in all of them
+                if self._topics is not None and not isinstance(error, DecodeError):
+                    raise LogError(f"{self.name}: {error}") from error
                 count, first = undecodable.get(channel.topic, (0, str(error)))
                 undecodable[channel.topic] = count + 1, first
-            except LogError as error:
-                if self._topics is not None:
-                    raise LogError(f"{self.name}: {error}") from error
-                self._warn(f"{self.name}: {error}")
         self._tell_undecodable(undecodable)
 
     def raw(self) -> Iterator[tuple[ChannelInfo, int, bytes | memoryview]]:
