@@ -32,7 +32,7 @@ class Patches:
     contrast: Float
     """Shape (n,), standard deviation of the patch in grey values."""
 
-    def take(self, index: NDArray[np.generic]) -> "Patches":
+    def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
         """The patches at the given indices or of the given mask."""
         return Patches(self.values[index], self.steps[index], self.inverse_hessian[index], self.contrast[index])
 
@@ -78,23 +78,22 @@ class PatchGrid:
         weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius_px + 0.5)) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
-        self.samples = float(1.0 / (self.weights**2).sum())
-        """Effective number of samples."""
+        self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
 
     def sample(self, image: Float32, px: Float, linear: Float | None = None) -> Float32:
         """Grey values (n, m) at `px + linear @ offset`; `linear` (n, 2, 2) or None for the identity."""
-        if linear is None:
-            places = px[:, None, :] + self.offsets[None]
-        else:
-            places = px[:, None, :] + np.einsum("nij,mj->nmi", linear, self.offsets)
-        places = np.where(np.isfinite(places), places, -10.0).astype(np.float32)
-        return cv2.remap(image, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        shifts = self._shifts[None] if linear is None else linear.astype(np.float32) @ self._shifts
+        start = np.where(np.isfinite(px), px, -10.0).astype(np.float32)
+        u = start[:, 0, None] + shifts[:, 0]
+        v = start[:, 1, None] + shifts[:, 1]
+        return _float32(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def normalise(self, values: Float32) -> tuple[Float32, Float32]:
         """Zero mean, unit variance under the weights; and the standard deviation (n,)."""
         centred = values - (values @ self.weights)[:, None]
-        deviation = np.sqrt(np.maximum((centred**2) @ self.weights, 1e-6))
-        return centred / deviation[:, None], deviation
+        deviation = np.sqrt(np.maximum((centred * centred) @ self.weights, 1e-6))
+        centred /= deviation[:, None]
+        return centred, deviation
 
 
 def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
@@ -112,14 +111,14 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
     )
     gradient /= deviation[:, None, None]
     gradient -= (gradient @ grid.weights)[:, :, None]
-    along = np.einsum("nim,nm,m->ni", gradient, values, grid.weights)
+    along = (gradient @ (values * grid.weights)[:, :, None])[:, :, 0]
     gradient -= along[:, :, None] * values[:, None, :]
     weighted = gradient * grid.weights
-    hessian = np.einsum("nim,njm->nij", weighted, gradient).astype(np.float64)
+    hessian = (weighted @ gradient.transpose(0, 2, 1)).astype(np.float64)
     hessian += 1e-9 * np.eye(2)
     inverse = np.linalg.inv(hessian)
-    steps = np.einsum("nij,njm->nim", inverse, weighted).astype(np.float32)
-    spread = np.einsum("nim,njm->nij", steps, steps).astype(np.float64)
+    steps = inverse.astype(np.float32) @ weighted
+    spread = (steps @ steps.transpose(0, 2, 1)).astype(np.float64)
     return Patches(values, steps, spread / (deviation.astype(np.float64) ** 2)[:, None, None], deviation.astype(float))
 
 
@@ -143,14 +142,13 @@ def align(
     step = np.full((n, 2), np.inf)
     active = np.ones(n, dtype=bool)
     difference = np.zeros_like(patches.values)
-    deviation = np.ones(n, np.float32)
     for _ in range(iterations):
         index = np.flatnonzero(active)
-        values, deviation[index] = grid.normalise(grid.sample(image, px[index], linear[index]))
+        values, _ = grid.normalise(grid.sample(image, px[index], linear[index]))
         difference[index] = values - patches.values[index]
-        step[index] = np.einsum("nim,nm->ni", patches.steps[index], difference[index])
+        step[index] = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0]
         limit = np.minimum(1.0, 1.5 / np.maximum(np.linalg.norm(step[index], axis=1), 1e-9))
-        px[index] -= np.einsum("nij,nj->ni", linear[index], step[index] * limit[:, None])
+        px[index] -= (linear[index] @ (step[index] * limit[:, None])[:, :, None])[:, :, 0]
         active[index] = np.linalg.norm(step[index], axis=1) > 0.01
         if not active.any():
             break
@@ -162,3 +160,8 @@ def align(
     moved = np.linalg.norm(px - guess, axis=1)
     converged = visible & ~active & (moved < 3.0)
     return Alignment(px, correlation, covariance.astype(np.float64), converged)
+
+
+def _float32(image: object) -> Float32:
+    """OpenCV's type stubs know no element type."""
+    return np.asarray(image, dtype=np.float32)

@@ -43,17 +43,29 @@ def flow(
 
 def checked_flow(
     source: Image, target: Image, px: Float, guess: Float, window: int, levels: int, tolerance_px: float
-) -> tuple[Float, Bool, Float]:
-    """Flow forth and back: positions (n, 2), which came back to their start, and the distance to it (n,).
+) -> tuple[Float, Bool]:
+    """Flow forth and back: positions (n, 2) and which came back to their start.
 
-    The way back starts where the guessed flow leads back to, not at the answer, and needs two levels only.
+    The guess is mostly good to a few pixels: one coarse level does, and only those that fail there are looked for
+    again from the coarsest level. Where most fail, the guess itself was wrong (a sudden turn).
     """
+    found, good = _there_and_back(source, target, px, guess, window, 1, tolerance_px)
+    if levels > 1 and not good.all():
+        again = ~good
+        found[again], good[again] = _there_and_back(
+            source, target, px[again], guess[again], window, levels, tolerance_px
+        )
+    return found, good
+
+
+def _there_and_back(
+    source: Image, target: Image, px: Float, guess: Float, window: int, levels: int, tolerance_px: float
+) -> tuple[Float, Bool]:
+    """The way back starts where the guessed flow leads back to, not at the answer."""
     found, good = flow(source, target, px, guess, window, levels)
     good &= inside(found, target.shape, 1.0)
-    back = np.full(len(px), np.inf)
     if good.any():
         start = px[good] + found[good] - guess[good]
-        returned, came_back = flow(target, source, found[good], start, window, 1)
-        distance = np.linalg.norm(returned - px[good], axis=1)
-        back[good] = np.where(came_back, distance, np.inf)
-    return found, good & (back < tolerance_px), back
+        returned, came_back = flow(target, source, found[good], start, window, min(levels - 1, 1))
+        good[good] = came_back & (np.linalg.norm(returned - px[good], axis=1) < tolerance_px)
+    return found, good

@@ -121,7 +121,7 @@ class StereoFrontEnd:
         start = self._flow_guess(guess)
         table = images.brightness_table(self._last.levels, pair.levels)
         source = self._last.left if table is None else table[self._last.left]
-        found, good, _ = checked_flow(
+        found, good = checked_flow(
             source,
             pair.left,
             tracks.raw_px,

@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry import Float, StereoGeometry, exponential, inverse, transform
+from .geometry import Float, StereoGeometry, exponential, inverse, project, projection_jacobian, transform
 
 Bool = NDArray[np.bool_]
 
-GATE = 16.3
-"""Chi-square of 4 degrees of freedom at 0.9974 (three sigma)."""
+GATE_2, GATE_4 = 11.9, 16.3
+"""Chi-square of 2 and 4 degrees of freedom at 0.9973."""
+MEDIAN_2, MEDIAN_4 = 1.386, 3.357
+"""Medians of chi-square of 2 and 4 degrees of freedom."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,7 @@ class Motion:
 def point_covariance(points: Float, covariance: Float, rig: StereoGeometry) -> Float:
     """Covariance (n, 3, 3) of triangulated points from that of their pixels (n, 4, 4), first order."""
     jacobian = rig.jacobian(points)
-    information = np.einsum("nji,njk,nkl->nil", jacobian, np.linalg.inv(covariance), jacobian)
+    information = jacobian.transpose(0, 2, 1) @ np.linalg.inv(covariance) @ jacobian
     return np.linalg.inv(information + 1e-12 * np.eye(3))
 
 
@@ -89,55 +91,71 @@ def _consensus(points: Float, left_px: Float, rig: StereoGeometry) -> Float | No
 
 
 class _Problem:
-    """Residuals of points seen again, with the covariance of points and pixels together."""
+    """Residuals of points seen again, with the covariance of points and pixels together.
+
+    Without any right pixel only the left two components are formed.
+    """
 
     def __init__(self, points: Float, points_cov: Float, px: Float, px_cov: Float, rig: StereoGeometry) -> None:
         self.points, self.points_cov, self.rig = points, points_cov, rig
-        self.seen = np.isfinite(px)
-        self.px = np.where(self.seen, px, 0.0)
-        both = self.seen[:, 2]
-        self.gate = np.where(both, GATE, 11.8)
+        both = np.isfinite(px[:, 2])
+        self.size = 4 if both.any() else 2
+        self.expected = np.where(both, MEDIAN_4, MEDIAN_2)
+        self.gate = np.where(both, GATE_4, GATE_2)
+        self.px = np.where(np.isfinite(px), px, 0.0)[:, : self.size]
+        self.seen = np.isfinite(px)[:, : self.size]
         # A right pixel that is missing gets a variance that lets its residual, set to zero, say nothing.
-        blind = np.where(both, 0.0, 1e6)[:, None, None] * np.diag([0.0, 0.0, 1.0, 1.0])
-        known = np.where(both[:, None, None], px_cov, 0.0)
-        known[:, :2, :2] = px_cov[:, :2, :2]
-        self.px_cov = known + blind
+        self.px_cov = np.array(px_cov[:, : self.size, : self.size])
+        self.px_cov[~both, 2:, 2:] = 1e6 * np.eye(self.size - 2)
 
-    def residuals(self, pose: Float) -> tuple[Float, Float, Float]:
-        """Residuals (n, 4), points in this camera (n, 3), whitening information (n, 4, 4)."""
+    def _residuals(self, here: Float) -> Float:
+        px = self.rig.project(here) if self.size == 4 else project(here, self.rig.left)
+        return np.where(self.seen, self.px - np.where(np.isfinite(px), px, 1e4), 0.0)
+
+    def _jacobian(self, here: Float) -> Float:
+        return self.rig.jacobian(here) if self.size == 4 else projection_jacobian(here, self.rig.left)
+
+    def _here(self, pose: Float) -> Float:
         here = transform(inverse(pose), self.points)
         here[:, 2] = np.maximum(here[:, 2], 1e-3)
-        residual = np.where(self.seen, self.px - np.nan_to_num(self.rig.project(here), nan=1e4), 0.0)
-        jacobian = self.rig.jacobian(here) @ pose[:3, :3].T
-        spread = np.einsum("nij,njk,nlk->nil", jacobian, self.points_cov, jacobian)
-        return residual, here, np.linalg.inv(self.px_cov + spread)
+        return here
+
+    def _information(self, pose: Float, here: Float) -> Float:
+        jacobian = self._jacobian(here) @ pose[:3, :3].T
+        return np.linalg.inv(self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1))
 
     def chi2(self, pose: Float) -> Float:
-        residual, _, information = self.residuals(pose)
-        return np.einsum("ni,nij,nj->n", residual, information, residual)
+        here = self._here(pose)
+        return _square(self._residuals(here), self._information(pose, here))
 
     def cost(self, pose: Float) -> float:
         return float(np.minimum(self.chi2(pose) / self.gate, 1.0).sum())
 
     def excess(self, pose: Float) -> float:
         """By how much the squared residuals exceed their covariance, from the median; at least one."""
-        ratio = self.chi2(pose) / np.where(self.seen[:, 2], 3.357, 1.386)
-        return float(np.clip(np.median(ratio), 1.0, 16.0))
+        return float(np.clip(np.median(self.chi2(pose) / self.expected), 1.0, 16.0))
 
-    def refine(self, pose: Float, steps: int = 8) -> Float:
+    def refine(self, pose: Float, steps: int = 10) -> Float:
         """Gauss-Newton with Cauchy weights; the pose is moved from the right."""
+        information = self._information(pose, self._here(pose))
         for _ in range(steps):
-            residual, here, information = self.residuals(pose)
-            weight = 1.0 / (1.0 + np.einsum("ni,nij,nj->n", residual, information, residual) / self.gate)
-            by_point = self.rig.jacobian(here)
+            here = self._here(pose)
+            residual = self._residuals(here)
+            weight = 1.0 / (1.0 + _square(residual, information) / self.gate)
+            by_point = self._jacobian(here)
             by_pose = np.concatenate((by_point @ _cross(here), -by_point), axis=2)
-            weighted = weight[:, None, None] * np.einsum("nji,njk->nik", by_pose, information)
-            normal = np.einsum("nij,njk->ik", weighted, by_pose) + 1e-6 * np.eye(6)
-            step = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residual))
+            weighted = (weight[:, None, None] * information) @ by_pose
+            normal = weighted.reshape(-1, 6).T @ by_pose.reshape(-1, 6) + 1e-6 * np.eye(6)
+            step = np.linalg.solve(normal, weighted.reshape(-1, 6).T @ residual.ravel())
             pose = pose @ exponential(step)
             if np.linalg.norm(step[:3]) < 1e-6 and np.linalg.norm(step[3:]) < 1e-6:
                 break
         return pose
+
+
+def _square(residual: Float, information: Float) -> Float:
+    """Squared residuals (n,) in sigmas."""
+    return ((residual[:, None, :] @ information)[:, 0] * residual).sum(axis=1)
 
 
 def _cross(p: Float) -> Float:

@@ -4,6 +4,7 @@ import numpy as np
 
 from .alignment import Alignment, Patches
 from .geometry import Float
+from .motion import MEDIAN_4
 
 
 class NoiseModel:
@@ -22,7 +23,7 @@ class NoiseModel:
     def learn_motion(self, chi2: Float) -> None:
         """Follows the median squared residual (in sigmas, 4 degrees of freedom) of a keyframe's motion."""
         if len(chi2) >= 20:
-            ratio = float(np.median(chi2)) / 3.357
+            ratio = float(np.median(chi2)) / MEDIAN_4
             self._gain = float(np.clip(self._gain * np.clip(ratio, 0.25, 4.0) ** 0.3, 0.2, 400.0))
 
     def residual_variance(self, right: Alignment, patches: Patches) -> Float:
