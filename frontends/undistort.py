@@ -40,9 +40,7 @@ class _Lens:
     """The distorted radius there."""
 
 
-def undistort(
-    camera: CameraModel, raw_px: Float, covariance_px2: Float | None = None
-) -> tuple[Float, Float | None]:
+def undistort(camera: CameraModel, raw_px: Float, covariance_px2: Float | None = None) -> tuple[Float, Float | None]:
     """Ideal pixels of raw ones, with the covariance carried over by the Jacobian.
 
     Args:
@@ -123,9 +121,11 @@ def _lens(model: str, D: tuple[float, ...], name: str) -> _Lens | None:
     if fisheye and not D:
         trimmed = (0.0,) * 4
     if len(trimmed) not in lengths or not np.isfinite(trimmed).all():
-        raise SurecutError(f"camera {name}: {model} with {len(D)} coefficients {list(D)}; it takes {lengths[-1]} numbers")
+        raise SurecutError(
+            f"camera {name}: {model} with {len(D)} coefficients {list(D)}; it takes {lengths[-1]} numbers"
+        )
     if fisheye:
-        return _with_limits(True, trimmed, (), (0.0, 0.0), (0.0,) * 4)
+        return _with_limits(True, trimmed, (), (0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
     k = (*trimmed, *([0.0] * (12 - len(trimmed))))
     return _with_limits(False, (k[0], k[1], k[4]), (k[5], k[6], k[7]), (k[2], k[3]), (k[8], k[9], k[10], k[11]))
 
@@ -150,7 +150,12 @@ def _polynomial(coefficients: tuple[float, ...], square: Float) -> tuple[Float, 
     """1 + c0 s + c1 s^2 + ..., and its derivative by s."""
     full = np.array([1.0, *coefficients])
     derivative = full[1:] * np.arange(1, len(full)) if len(full) > 1 else np.zeros(1)
-    return np.polynomial.polynomial.polyval(square, full), np.polynomial.polynomial.polyval(square, derivative)
+    value, slope = np.zeros_like(square), np.zeros_like(square)
+    for coefficient in full[::-1]:
+        value = value * square + coefficient
+    for coefficient in derivative[::-1]:
+        slope = slope * square + coefficient
+    return value, slope
 
 
 def _radial(lens: _Lens, radius: Float) -> tuple[Float, Float]:
