@@ -117,6 +117,35 @@ class DistanceEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class Advice:
+    """A further measurement, and what it is predicted to do for one point."""
+
+    action: str
+    """What to do, as an order to the operator."""
+    detail: str
+    """From where, how often, with what."""
+    predicted_radius95_m: float
+    """The point's `radius95_m` once the predicted factors are in the graph."""
+    gain: float
+    """1 less the ratio of predicted and present radius: 0 changes nothing, 1 removes all doubt."""
+
+
+@dataclass(frozen=True, slots=True)
+class PickView:
+    """The image that was clicked, with the estimate's uncertainty as that camera sees it."""
+
+    camera: str
+    stamp_ns: int
+    point_id: str
+    image: bytes
+    """PNG or JPEG, whole or cut out round the pick."""
+    pixel: Float
+    """Shape (2,), the estimate in this image, OpenCV convention."""
+    ellipse_px2: Float
+    """Shape (2, 2), covariance of the estimate in this image."""
+
+
+@dataclass(frozen=True, slots=True)
 class Result:
     """Everything that was estimated from one recording."""
 
@@ -140,3 +169,6 @@ class Result:
     """The effective rig."""
     last_board_view_ns: int | None
     end_ns: int
+    advice: dict[str, tuple[Advice, ...]] = field(default_factory=dict)
+    """What to measure next, by point id, best first."""
+    pick_views: tuple[PickView, ...] = ()
