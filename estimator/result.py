@@ -28,6 +28,19 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class NearestSurface:
+    """The mapped surface next to a point that is not the point's own pipe."""
+
+    what: str
+    distance_m: float
+    """From the point (on the axis, where there is one) to the surface."""
+    sigma_m: float
+    """Of the distance, from the joint of point and surface."""
+    direction: Float
+    """Shape (3,), unit, from the point to the surface, in the point's frame."""
+
+
+@dataclass(frozen=True, slots=True)
 class PointEstimate:
     """A pipe point in the robot's frame."""
 
@@ -47,6 +60,8 @@ class PointEstimate:
     pipe_id: str | None = None
     budget: dict[str, Float] = field(default_factory=dict)
     """Contribution of each source to `covariance_m2`, shape (3, 3) each; they sum to it exactly."""
+    nearest_surface: NearestSurface | None = None
+    """None: the map was not asked, or shows nothing but the pipe itself."""
 
 
 @dataclass(frozen=True, slots=True)
