@@ -180,6 +180,9 @@ class Cut(Section):
     tool_sigma_m: NonNegative = 0.002
     """Standard deviation of the tool centre against its command, per axis: robot and tool together."""
     wrong_go_probability: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    board_age_limit_s: Positive = 120.0
+    """Longest time since a board was last seen. After it nobody has looked whether the machine still stands where it
+    stood. The default is an agreement, not a measurement: time to put the camera down, click and read the report."""
 
 
 class Pipe(Section):
