@@ -1,0 +1,36 @@
+"""Pixels of points in {o}: native GTSAM factors, with the camera's calibration as a variable."""
+
+import gtsam
+import gtsam_unstable
+import numpy as np
+from numpy.typing import NDArray
+
+from . import keys
+from .noise import Model
+
+Float = NDArray[np.float64]
+
+
+def mobile_projection(camera: str, px: Float, model: Model, keyframe: int, point: int) -> gtsam.NonlinearFactor:
+    """A point seen by the mobile camera, left or right.
+
+    Args:
+        camera: `m_left` or `m_right`.
+        px: shape (2,), ideal pixels.
+        keyframe: key of `o_T_m`.
+        point: key of the point in {o}.
+    """
+    if camera == "m_left":
+        return gtsam.GeneralSFMFactor2Cal3_S2(px, model, keyframe, point, keys.intrinsics(camera))
+    return _with_extrinsics(camera, px, model, keyframe, point)
+
+
+def machine_projection(px: Float, model: Model, base: int, point: int) -> gtsam.NonlinearFactor:
+    """A point seen by the Kinect's colour camera, at ideal pixels `px`; `base` is the key of `o_T_b`."""
+    return _with_extrinsics("b_rgb", px, model, base, point)
+
+
+def _with_extrinsics(camera: str, px: Float, model: Model, pose: int, point: int) -> gtsam.NonlinearFactor:
+    return gtsam_unstable.ProjectionFactorPPPCCal3_S2(
+        px, model, pose, keys.extrinsics(camera), point, keys.intrinsics(camera)
+    )
