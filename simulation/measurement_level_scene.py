@@ -92,13 +92,13 @@ def mobile_path(scene: Scene, board: Float, motion: Motion, rng: np.random.Gener
     share, end = motion.board_share, motion.duration_s
     pipe = scene.pipe.base + 1.0 * scene.pipe.axis
     turn = rng.uniform(-0.1, 0.1, (8, 3))
-    start = board + [rng.uniform(1.0, 1.25), rng.uniform(-0.25, 0.25), rng.uniform(-0.1, 0.15)]
+    start = board + rng.uniform([1.0, -0.25, -0.1], [1.25, 0.25, 0.15])
     places = [pipe + _around(angle, scene.side, rng.uniform(0.9, 1.3)) for angle in (-0.7, 0.0, 0.7)]
     way = np.array(
         [
             start,
-            start + [rng.uniform(-0.15, 0.0), rng.uniform(-0.3, 0.3), rng.uniform(-0.15, 0.15)],
-            start + [0.05, 0.35 * scene.side, rng.uniform(-0.1, 0.1)],
+            start + rng.uniform([-0.15, -0.3, -0.15], [0.0, 0.3, 0.15]),
+            start + np.array([0.05, 0.35 * scene.side, rng.uniform(-0.1, 0.1)]),
             np.array([1.25, 1.15 * scene.side + pipe[1] * 0.5, 1.35]) + turn[3],
             *places,
         ]
@@ -126,23 +126,19 @@ def mobile_path(scene: Scene, board: Float, motion: Motion, rng: np.random.Gener
 def occluded(eyes: Float, points: Float, surfaces: Rectangles, pipe: Cylinder | None = None) -> Bool:
     """Whether something stands between eyes and points. Both shape (n, 3); answer shape (n,)."""
     rays = points - eyes
-    hit = np.zeros(len(points), dtype=bool)
-    for index in range(len(surfaces.corner)):
-        distance = _rectangle_hit(eyes, rays, surfaces, index)
-        hit |= (distance > 1e-6) & (distance < 1.0 - 1e-3)
+    distances = _rectangle_hits(eyes, rays, surfaces)
     if pipe is not None:
-        distance = _cylinder_hit(eyes, rays, pipe)
-        hit |= (distance > 1e-6) & (distance < 1.0 - 1e-3)
-    return hit
+        distances = np.c_[distances, _cylinder_hit(eyes, rays, pipe)]
+    return np.asarray(((distances > 1e-6) & (distances < 1.0 - 1e-3)).any(axis=1))
 
 
 def cast(eye: Float, rays: Float, scene: Scene) -> tuple[Float, Float, Bool]:
     """First surface along rays: distance in ray lengths (inf: none), normals (n, 3), and whether it is the pipe."""
     eyes = np.broadcast_to(eye, rays.shape)
-    hits = np.array([_rectangle_hit(eyes, rays, scene.surfaces, i) for i in range(len(scene.surfaces.corner))])
+    hits = _rectangle_hits(eyes, rays, scene.surfaces)
     hits = np.where(hits > 1e-6, hits, np.inf)
-    first = hits.argmin(axis=0)
-    distance = hits.min(axis=0)
+    first = hits.argmin(axis=1)
+    distance = hits.min(axis=1)
     normals = scene.surfaces.normal[first]
     pipe_distance = _cylinder_hit(eyes, rays, scene.pipe)
     on_pipe = (pipe_distance > 1e-6) & (pipe_distance < distance)
@@ -154,16 +150,16 @@ def cast(eye: Float, rays: Float, scene: Scene) -> tuple[Float, Float, Bool]:
     return distance, normals, on_pipe
 
 
-def _rectangle_hit(eyes: Float, rays: Float, surfaces: Rectangles, index: int) -> Float:
-    """Ray parameter of the hit with one rectangle, inf where it is missed. Both sides stop a ray."""
-    normal = surfaces.normal[index]
-    slope = rays @ normal
+def _rectangle_hits(eyes: Float, rays: Float, surfaces: Rectangles) -> Float:
+    """Ray parameters of the hits with m rectangles, inf where missed; shape (n, m). Both sides stop a ray."""
+    towards = (surfaces.corner * surfaces.normal).sum(1) - eyes @ surfaces.normal.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = ((surfaces.corner[index] - eyes) @ normal) / slope
-        place = eyes + t[:, None] * rays - surfaces.corner[index]
+        t = towards / (rays @ surfaces.normal.T)
         inside = np.isfinite(t)
-        for edge in (surfaces.edge_u[index], surfaces.edge_v[index]):
-            s = place @ edge / (edge @ edge)
+        for edge in (surfaces.edge_u, surfaces.edge_v):
+            square = (edge**2).sum(1)
+            start = (eyes @ edge.T - (surfaces.corner * edge).sum(1)) / square
+            s = start + t * (rays @ edge.T / square)
             inside &= (s >= 0.0) & (s <= 1.0)
     return np.where(inside, t, np.inf)
 

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..factors.board import CORNER_PRINT_SIGMA_M, DIRECTIONS, marker_rotation
+from ..factors.calibration import ASPECT_REL
 from ..factors.rig import Board, Pose, Rig
 
 Float = NDArray[np.float64]
@@ -49,7 +51,7 @@ class TrueRig:
     """Shape (4, 4), of the board that the mount names."""
     depth_offset_m: float
     depth_scale: float
-    """Measured depth is true depth times (1 + scale), plus the offset."""
+    """True depth is measured depth times (1 + scale), plus the offset."""
     boards: dict[str, TrueBoard]
 
 
@@ -128,12 +130,14 @@ def draw_board(board: Board, rng: np.random.Generator | None) -> TrueBoard:
     n = len(board.markers)
     print_scale = 1.0 + (0.0 if rng is None else float(rng.normal(0.0, board.print_scale_sigma)))
     side_m = board.side_m + (0.0 if rng is None else float(rng.normal(0.0, board.side_sigma_m)))
-    shifts_m = np.zeros((n, 2)) if rng is None else rng.normal(0.0, board.centre_sigma_m, (n, 2))
     centres_m = np.zeros((n, 3))
-    centres_m[:, :2] = print_scale * np.array([marker.centre_m for marker in board.markers]) + shifts_m
-    turns = Rotation.from_rotvec([[0.0, 0.0, marker.rotation_rad] for marker in board.markers]).as_matrix()
-    unit = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
-    corners_m = centres_m[:, None] + side_m * np.einsum("nij,cj->nci", turns, unit)
+    centres_m[:, :2] = print_scale * np.array([marker.centre_m for marker in board.markers])
+    ragged_m = np.zeros((n, 4, 3))
+    if rng is not None:
+        centres_m += rng.normal(0.0, board.centre_sigma_m, (n, 3))
+        ragged_m = rng.normal(0.0, CORNER_PRINT_SIGMA_M, (n, 4, 3))
+    squares_m = np.array([0.5 * side_m * DIRECTIONS @ marker_rotation(marker).T for marker in board.markers])
+    corners_m = centres_m[:, None] + squares_m + ragged_m
     return TrueBoard(
         id=board.id,
         markers=tuple(marker.id for marker in board.markers),
@@ -148,7 +152,7 @@ def _draw_camera(camera: TrueCamera, rig: Rig, rng: np.random.Generator) -> True
     prior = getattr(rig.cameras, camera.name)
     K = camera.K.copy()
     if "focal" not in prior.freeze:
-        K[[0, 1], [0, 1]] *= 1.0 + rng.normal(0.0, prior.focal_sigma_rel)
+        K[[0, 1], [0, 1]] *= 1.0 + rng.normal(0.0, prior.focal_sigma_rel) + rng.normal(0.0, ASPECT_REL, 2)
     if "centre" not in prior.freeze:
         K[:2, 2] += rng.normal(0.0, prior.centre_sigma_px, 2)
     return TrueCamera(camera.name, camera.width, camera.height, K)
