@@ -53,7 +53,9 @@ class Atlas:
         np.multiply(texels[1], size, out=y[:count])
         y[:count] += offset[:, 1]
         shape = (rows, 1024)
-        found = cv2.remap(self.image, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        found = cv2.remap(
+            self.image, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         return found.reshape(-1)[:count].astype(np.float32)
 
 

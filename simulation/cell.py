@@ -96,7 +96,9 @@ def _pipe_truth(scenario: Scenario, side: float, rng: np.random.Generator) -> Pi
     return PipeTruth(middle - axis * 1.1 / axis[2], axis, diameter / 2)
 
 
-def _pipe(pipe: PipeTruth, ceiling: float, points: dict[str, tuple[str, Float]], rng: np.random.Generator) -> list[Patch]:
+def _pipe(
+    pipe: PipeTruth, ceiling: float, points: dict[str, tuple[str, Float]], rng: np.random.Generator
+) -> list[Patch]:
     """Floor to ceiling, with welded flanges above and below the cut, clamps and a branch."""
     look = textures.steel(rng.uniform(0.22, 0.38))
     top = pipe.at_height(ceiling)
@@ -144,7 +146,7 @@ def _panel(scenario: Scenario, pipe: PipeTruth, rng: np.random.Generator) -> lis
         return []
     share = 0.75 / pipe.at_height(1.1)[1]
     reach = [pipe.at_height(z)[0] * share for z in (0.0, 2.0)]
-    left, right = min(reach) - 0.22 - pipe.radius_m, max(reach) + 0.22 + pipe.radius_m
+    left, right = min(reach) - 0.13 - pipe.radius_m, max(reach) + 0.13 + pipe.radius_m
     size = (right - left, 0.03, rng.uniform(1.9, 2.1))
     look = textures.plain(rng.uniform(0.45, 0.65), 0.008, 0.02)
     return [
@@ -283,7 +285,7 @@ def _machine(c_T_b: Float, side: float, rng: np.random.Generator) -> list[Patch]
         *box((0.08, 0.08, 0.6), metal, (0.0, -0.12, 0.82), 0.003, yellow),
         *box((side * 0.7, 0.03, 0.03) if side > 0 else (0.7, 0.03, 0.03), dark, (side * 0.2, -0.16, 1.08), 0.003),
     ]
-    for patch in box((0.28, 0.06, 0.06), dark, (0.0125, 0.0, -0.04), 0.002):
+    for patch in box((0.28, 0.06, 0.06), dark, (0.0125, 0.04, 0.0), 0.002):
         patches.append(_turned(patch, c_T_b @ rigid(Rotation.from_euler("x", -90, degrees=True))))
     for arm in (-1.0, 1.0):
         shoulder = np.array([arm * 0.32, 0.02, 0.72])
@@ -326,9 +328,7 @@ def _arm(length_m: float, radius_m: float, rng: np.random.Generator) -> list[Pat
     return patches + rod(stripe, stripe + [0, 0.1, 0], 1.05 * radius_m, textures.stripes, 0.002, 0.05, 48)
 
 
-def _lamps(
-    room: tuple[float, float, float, float, float], level: float, rng: np.random.Generator
-) -> list[Lamp]:
+def _lamps(room: tuple[float, float, float, float, float], level: float, rng: np.random.Generator) -> list[Lamp]:
     left, right, back, front, top = room
     lamps = []
     for x, y in ((0.3, 0.75), (0.72, 0.6), (0.5, 0.2)):

@@ -179,9 +179,9 @@ def _rig_file(
             true = float(np.linalg.norm(np.subtract(a.centre_m, b.centre_m)))
             sigma = max(sigmas.distance_m, 1e-5)
             measured = round(true + rng.normal(0, sigma), 5)
-            distances.append(Distance.model_validate(
-                {"from": str(a.id), "to": str(b.id), "distance_m": measured, "sigma_m": sigma}
-            ))
+            distances.append(
+                Distance.model_validate({"from": str(a.id), "to": str(b.id), "distance_m": measured, "sigma_m": sigma})
+            )
     page = Board(
         id="f0",
         side_m=board.typed_side_m or board.side_m,

@@ -18,8 +18,11 @@ from .textures import brick, poster
 Float = NDArray[np.float64]
 # Sub-sample and share of the exposure: each place in the pixel sees its own moments, centred on the middle.
 _FOUR = ((0, -0.375), (3, -0.125), (1, 0.125), (2, 0.375))
-_EIGHT = tuple((place, sign * time) for place, time in zip((0, 3, 1, 2), (0.4375, 0.3125, 0.1875, 0.0625), strict=True)
-               for sign in (-1, 1))
+_EIGHT = tuple(
+    (place, sign * time)
+    for place, time in zip((0, 3, 1, 2), (0.4375, 0.3125, 0.1875, 0.0625), strict=True)
+    for sign in (-1, 1)
+)
 
 
 def render_light(

@@ -52,9 +52,7 @@ def project(camera: CameraModel, points: Float) -> Float:
     return np.where(points[:, 2:] > 1e-6, pixels.reshape(-1, 2), np.nan)
 
 
-def expose(
-    light: NDArray[np.float32], settings: Light, gain: float, rng: np.random.Generator
-) -> NDArray[np.uint8]:
+def expose(light: NDArray[np.float32], settings: Light, gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Digital image of radiance (height, width) or (height, width, 3).
 
     Lens blur and vignetting, then photon noise, read noise, gamma and eight bits. `gain` takes radiance to full

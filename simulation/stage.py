@@ -1,7 +1,7 @@
 """The scene as triangles with texture charts, ready for rays: where they hit, and how bright it is there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -16,8 +16,6 @@ from .surfaces import Body, Patch
 Float = NDArray[np.float64]
 Poses = Mapping[str, Float]
 """Body name -> `w_T_body`, shape (4, 4)."""
-_COLUMNS = 17
-"""Per triangle: chart corner (2), its two edges (4), log2 texel (1), chart (1), specular (1), normals (3x3 less 1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +38,8 @@ class Hits:
     """Row of the stage's triangle table."""
     barycentric: NDArray[np.float32]
     """Shape (n, 2)."""
+    flat_normal: NDArray[np.float32]
+    """Shape (n, 3), of the triangle, in the world, either side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,23 +82,25 @@ class View:
     scene: Any
     rotations: NDArray[np.float32]
     """Shape (bodies, 3, 3), `w_R_body`."""
-    threads: int = field(default=2)
+    threads: int = 1
 
     def cast(self, rays: NDArray[np.float32]) -> Hits:
         """First hits of rays (n, 6): origin and direction in the world."""
         open3d = load_open3d()
-        found = self.scene.cast_rays(open3d.core.Tensor(rays), nthreads=self.threads)
+        found = self.scene.cast_rays(open3d.core.Tensor.from_numpy(rays), nthreads=self.threads)
         distance = found["t_hit"].numpy()
         body = found["geometry_ids"].numpy()
         missed = ~np.isfinite(distance)
-        known = np.where(missed, 0, body).astype(np.intp)
-        triangle = self.stage.first_triangle[known] + np.where(missed, 0, found["primitive_ids"].numpy())
-        return Hits(distance, body, triangle, found["primitive_uvs"].numpy())
+        own = found["primitive_ids"].numpy()
+        if missed.any():
+            body, own = np.where(missed, np.uint32(0), body), np.where(missed, np.uint32(0), own)
+        triangle = np.take(self.stage.first_triangle, body) + own
+        return Hits(distance, body, triangle, found["primitive_uvs"].numpy(), found["primitive_normals"].numpy())
 
     def blocked(self, rays: NDArray[np.float32], near: float, far: float) -> NDArray[np.bool_]:
         """Whether anything stands on each ray between near and far (in lengths of its direction)."""
         open3d = load_open3d()
-        tensor = open3d.core.Tensor(np.ascontiguousarray(rays, np.float32))
+        tensor = open3d.core.Tensor.from_numpy(np.ascontiguousarray(rays, np.float32))
         return self.scene.test_occlusions(tensor, near, far, nthreads=self.threads).numpy()
 
     def radiance(self, rays: NDArray[np.float32], spread: float, colour: bool = False) -> NDArray[np.float32]:
@@ -113,63 +115,69 @@ class View:
         uv = np.take(stage.uv, hits.triangle, axis=0)
         a, b = hits.barycentric[:, 0], hits.barycentric[:, 1]
         texels = np.stack([uv[:, 0] + a * uv[:, 2] + b * uv[:, 4], uv[:, 1] + a * uv[:, 3] + b * uv[:, 5]])
-        normal = self._normals(hits)
         direction = rays[:, 3:]
-        cosine = np.abs(np.einsum("ij,ij->i", normal, direction)) / np.sqrt(np.einsum("ij,ij->i", direction, direction))
+        cosine = np.abs(np.einsum("ij,ij->i", hits.flat_normal, direction))
+        cosine /= np.sqrt(np.einsum("ij,ij->i", direction, direction))
         chart = np.take(stage.chart, hits.triangle)
-        texel = np.take(_texels(stage), chart)
-        reach = np.where(np.isfinite(hits.distance), hits.distance, 1.0).astype(np.float32)
-        level = np.log2(np.maximum(reach * np.float32(spread) / (texel * np.sqrt(np.maximum(cosine, 0.03))), 1e-6))
+        missed = ~np.isfinite(hits.distance)
+        reach = np.where(missed, np.float32(1), hits.distance)
+        # The footprint of a sample on a turned surface is an ellipse: take the circle of the same area.
+        size = reach * np.float32(spread) / np.sqrt(np.maximum(cosine, np.float32(0.03)))
+        level = np.log2(np.maximum(size / np.take(_texels(stage), chart), np.float32(1e-6)))
         light = stage.atlas.sample(chart, texels, level)
         if colour:
-            light = light[:, None] * np.array([patch.tint_bgr for patch in stage.patches], np.float32)[chart]
-        self._add_mirrored(light, chart, direction, normal, rays[:, :3] + reach[:, None] * direction)
-        light[~np.isfinite(hits.distance)] = 0
+            light = light[:, None] * np.take(_tints(stage), chart, axis=0)
+        self._add_mirrored(light, hits, chart, rays, reach)
+        light[missed] = 0
         return light
 
-    def _normals(self, hits: Hits) -> NDArray[np.float32]:
-        """Smooth normals in the world, shape (n, 3), not quite of length 1 between corners."""
-        corners = np.take(self.stage.normals, hits.triangle, axis=0)
-        a, b = hits.barycentric[:, :1], hits.barycentric[:, 1:]
+    def normals(self, hits: Hits, rows: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Smooth unit normals in the world of some of the hits, shape (len(rows), 3)."""
+        corners = np.take(self.stage.normals, hits.triangle[rows], axis=0)
+        a, b = hits.barycentric[rows, :1], hits.barycentric[rows, 1:]
         local = corners[:, 0] * (1 - a - b) + corners[:, 1] * a + corners[:, 2] * b
-        turned = np.flatnonzero([not np.allclose(rotation, np.eye(3)) for rotation in self.rotations])
-        for index in turned:
-            rows = np.flatnonzero(hits.body == index)
-            local[rows] = local[rows] @ self.rotations[index].T
-        return local
+        local /= np.linalg.norm(local, axis=1, keepdims=True)
+        return np.einsum("nij,nj->ni", np.take(self.rotations, hits.body[rows], axis=0), local)
 
     def _add_mirrored(
         self,
         light: NDArray[np.float32],
+        hits: Hits,
         chart: NDArray[np.int32],
-        direction: NDArray[np.float32],
-        normal: NDArray[np.float32],
-        points: NDArray[np.float32],
+        rays: NDArray[np.float32],
+        reach: NDArray[np.float32],
     ) -> None:
         """Lamps and bright and dark bands of the room, mirrored in metal: what moves over it with the viewer."""
-        share = np.array([patch.specular for patch in self.stage.patches], np.float32)[chart]
-        rows = np.flatnonzero(share > 0)
+        share = np.take(_mirrors(self.stage), chart)
+        rows = np.flatnonzero(share)
         if not len(rows):
             return
-        ray = direction[rows] / np.linalg.norm(direction[rows], axis=1, keepdims=True)
-        n = normal[rows] / np.linalg.norm(normal[rows], axis=1, keepdims=True)
+        direction = rays[rows, 3:]
+        points = rays[rows, :3] + reach[rows, None] * direction
+        ray = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        n = self.normals(hits, rows)
         mirrored = ray - 2 * np.einsum("ij,ij->i", ray, n)[:, None] * n
         bearing = np.arctan2(mirrored[:, 1], mirrored[:, 0])
         extra = 0.10 + 0.07 * np.sin(2 * bearing + 0.7) + 0.05 * np.sin(5 * bearing + 2.1) + 0.06 * mirrored[:, 2]
         for lamp in self.stage.lamps:
-            to_lamp = lamp.position_m.astype(np.float32) - points[rows]
+            to_lamp = lamp.position_m.astype(np.float32) - points
             away = np.linalg.norm(to_lamp, axis=1)
             cosine = np.clip(np.einsum("ij,ij->i", mirrored, to_lamp) / away, 0, 1)
             extra += np.float32(lamp.power) * (1.2 * cosine**60 + 0.25 * cosine**12) / (0.5 + away**2)
-        extra = np.maximum(extra, 0) * share[rows]
-        if light.ndim == 2:
-            light[rows] += extra[:, None]
-        else:
-            light[rows] += extra
+        extra = (np.maximum(extra, 0) * share[rows]).astype(np.float32)
+        light[rows] += extra if light.ndim == 1 else extra[:, None]
 
 
 def _texels(stage: Stage) -> NDArray[np.float32]:
     return np.array([patch.texel_m for patch in stage.patches], np.float32)
+
+
+def _tints(stage: Stage) -> NDArray[np.float32]:
+    return np.array([patch.tint_bgr for patch in stage.patches], np.float32)
+
+
+def _mirrors(stage: Stage) -> NDArray[np.float32]:
+    return np.array([patch.specular for patch in stage.patches], np.float32)
 
 
 def build_stage(bodies: list[Body], lamps: list[Lamp], poses: Poses, rng: np.random.Generator) -> Stage:

@@ -120,9 +120,7 @@ def blot(image: Image, texel_m: float, rng: Rng) -> None:
     centre = rng.random(2) * image.shape[::-1]
     axes = np.maximum(1, rng.gamma(2.0, 0.03, 2) / texel_m)
     angle = rng.uniform(0, 180)
-    cv2.ellipse(
-        layer, (centre.astype(int).tolist()), (axes.astype(int).tolist()), angle, 0, 360, 1.0, -1, cv2.LINE_AA
-    )
+    cv2.ellipse(layer, (centre.astype(int).tolist()), (axes.astype(int).tolist()), angle, 0, 360, 1.0, -1, cv2.LINE_AA)
     image *= 1 + np.float32(rng.uniform(-0.55, 0.3)) * layer
 
 
@@ -170,9 +168,7 @@ def word(image: Image, texel_m: float, rng: Rng, height_m: float, value: float) 
     left = rng.uniform(0.05, 0.95) * max(1, image.shape[1] - wide)
     base = high + rng.uniform(0.05, 0.9) * max(1, image.shape[0] - high)
     layer = np.zeros(image.shape, np.uint8)
-    cv2.putText(
-        layer, text, (int(left), int(base)), cv2.FONT_HERSHEY_SIMPLEX, scale, (255,), thick, cv2.LINE_AA
-    )
+    cv2.putText(layer, text, (int(left), int(base)), cv2.FONT_HERSHEY_SIMPLEX, scale, (255,), thick, cv2.LINE_AA)
     mask = layer.astype(np.float32) / 255
     image += mask * (np.float32(value) - image)
 
