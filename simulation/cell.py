@@ -103,7 +103,7 @@ def _pipe(
     look = textures.steel(rng.uniform(0.22, 0.38))
     top = pipe.at_height(ceiling)
     length = float(np.linalg.norm(top - pipe.foot_m))
-    patches = [Patch(Tube(top, -pipe.axis, pipe.radius_m, length, 256), look, 0.0015, specular=rng.uniform(0.35, 0.6))]
+    patches = [Patch(Tube(top, -pipe.axis, pipe.radius_m, length, 160), look, 0.0015, specular=rng.uniform(0.35, 0.6))]
     heights = [points["P2"][1][2] - rng.uniform(0.25, 0.4), points["P1"][1][2] + rng.uniform(0.22, 0.4)]
     for height in heights:
         centre = pipe.at_height(height)
@@ -293,7 +293,7 @@ def _machine(c_T_b: Float, side: float, rng: np.random.Generator) -> list[Patch]
         hand = elbow + np.array([-arm * 0.02, 0.12, 0.22])
         patches += rod(shoulder, elbow, 0.05, metal, 0.003, 0.1, 32, yellow)
         patches += rod(elbow, hand, 0.04, metal, 0.003, 0.1, 32, yellow)
-        patches += rod(hand, hand + [0, 0.08, 0.02], 0.06, dark, 0.003, 0.1, 32)
+        patches += rod(hand, hand + np.array([0, 0.08, 0.02]), 0.06, dark, 0.003, 0.1, 32)
     return patches
 
 
@@ -323,9 +323,11 @@ def _arm(length_m: float, radius_m: float, rng: np.random.Generator) -> list[Pat
     look = textures.plain(rng.uniform(0.3, 0.5), 0.015, 0.05)
     start, end = np.zeros(3), np.array([0, length_m, 0])
     patches = rod(start, end, radius_m, look, 0.003, 0.15, 48, (0.25, 0.75, 1.0))
-    patches += rod(start - [0, 0.03, 0], start + [0, 0.07, 0], 1.4 * radius_m, look, 0.003, 0.15, 48)
+    patches += rod(
+        start - np.array([0, 0.03, 0]), start + np.array([0, 0.07, 0]), 1.4 * radius_m, look, 0.003, 0.15, 48
+    )
     stripe = 0.7 * end
-    return patches + rod(stripe, stripe + [0, 0.1, 0], 1.05 * radius_m, textures.stripes, 0.002, 0.05, 48)
+    return patches + rod(stripe, stripe + np.array([0, 0.1, 0]), 1.05 * radius_m, textures.stripes, 0.002, 0.05, 48)
 
 
 def _lamps(room: tuple[float, float, float, float, float], level: float, rng: np.random.Generator) -> list[Lamp]:

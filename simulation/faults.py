@@ -61,7 +61,9 @@ def draw_rig(scenario: Scenario, side: float, rng: np.random.Generator) -> RigPa
 def _nominal_cameras(scenario: Scenario) -> dict[str, CameraModel]:
     mobile, kinect = scenario.mobile, scenario.kinect
 
-    def camera(name: str, size: tuple[int, int], focal: float, d: tuple[float, ...], baseline: float | None):
+    def camera(
+        name: str, size: tuple[int, int], focal: float, d: tuple[float, ...], baseline: float | None
+    ) -> CameraModel:
         k = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
         coefficients = np.array((*d, *(0.0,) * (5 - len(d))))
         return CameraModel(name, *size, k, "plumb_bob", coefficients, np.eye(3), baseline)

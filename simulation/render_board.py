@@ -128,5 +128,5 @@ def board_stage(
         Body("page", [Patch(page, page_texture(markers, dictionary), 0.0002)]),
         Body("wall", [Patch(wall, brick(0.35), 0.0025), Patch(sheet, poster, 0.0015)]),
     ]
-    lamps = [Lamp(np.array([*rng.normal(0, 0.8, 2), 2.5]) + [0, 1.0, 0], 0.4, 3.0)]
+    lamps = [Lamp(np.array([*rng.normal((0, 1.0), 0.8), 2.5]), 0.4, 3.0)]
     return build_stage(bodies, lamps, {body.name: np.eye(4) for body in bodies}, rng)

@@ -43,7 +43,7 @@ class Tube:
     axis: Float
     radius_m: float
     height_m: float
-    segments: int = 160
+    segments: int = 96
 
     @property
     def width_m(self) -> float:
@@ -61,9 +61,13 @@ class Tube:
 
     def mesh(self) -> tuple[Float, NDArray[np.int64]]:
         """Chart coordinates of the vertices (n, 2) and triangles (m, 3)."""
+        # Short pieces: long slivers of a tilted tube have huge bounding boxes, and rays become seven times slower.
+        pieces = max(1, int(np.ceil(self.height_m / (2.5 * self.radius_m))))
         u = np.linspace(0, self.width_m, self.segments + 1)
-        chart = np.stack([np.tile(u, 2), np.repeat([0.0, self.height_m], len(u))], axis=1)
-        a = np.arange(self.segments)
+        v = np.linspace(0, self.height_m, pieces + 1)
+        chart = np.stack([np.tile(u, len(v)), np.repeat(v, len(u))], axis=1)
+        ring, step = np.meshgrid(np.arange(pieces) * len(u), np.arange(self.segments), indexing="ij")
+        a = (ring + step).ravel()
         b = a + len(u)
         return chart, np.concatenate([np.stack([a, a + 1, b + 1], 1), np.stack([a, b + 1, b], 1)])
 
@@ -153,7 +157,7 @@ def rod(
     texture: Texture,
     texel_m: float = 0.0015,
     specular: float = 0.0,
-    segments: int = 160,
+    segments: int = 96,
     tint_bgr: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> list[Patch]:
     """A closed cylinder from start to end."""

@@ -163,7 +163,7 @@ def word(image: Image, texel_m: float, rng: Rng, height_m: float, value: float) 
     scale = height_m / texel_m / 22
     if scale < 0.2:
         return
-    thick = max(1, int(round(2.2 * scale)))
+    thick = max(1, round(2.2 * scale))
     (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, thick)
     left = rng.uniform(0.05, 0.95) * max(1, image.shape[1] - wide)
     base = high + rng.uniform(0.05, 0.9) * max(1, image.shape[0] - high)

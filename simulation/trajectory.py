@@ -1,6 +1,7 @@
 """How the mobile camera moves: from the board round the panel, to three places that see the pipe, and back or not."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ def _stops(
     stops = [
         _Stop(0.0, start, board),
         _Stop(0.05, start + rng.normal(0, 0.03, 3), board),
-        _Stop(0.13, start + np.array([cell.side * 0.05, 0.04, 0.05]), board + [0, 0.05, -0.03]),
+        _Stop(0.13, start + np.array([cell.side * 0.05, 0.04, 0.05]), board + np.array([0, 0.05, -0.03])),
         _Stop(0.24, forward, 0.35 * board + 0.65 * ahead),
     ]
     dwells = []
@@ -110,7 +111,7 @@ def _stops(
 def _sharpened(stops: list[_Stop], dwells: list[tuple[float, float]], rng: np.random.Generator) -> list[_Stop]:
     """Between the stops: darts to the side and glances away, there and back within about a second."""
     sharp = [stops[0]]
-    for last, stop in zip(stops, stops[1:], strict=False):
+    for last, stop in pairwise(stops):
         gap = stop.share - last.share
         if gap > 0.065:
             middle = 0.5 * (last.place + stop.place)
