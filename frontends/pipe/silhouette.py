@@ -1,6 +1,6 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from ..rays import ideal_from_raw, pixel_rays, raw_from_ideal
 from .edges import image_noise, straight_lines
 from .limb import EdgeFit, fit_edge
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
+from .surface import occlusion_score
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -83,6 +84,8 @@ class OutlineFinder:
         if not pairs:
             return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
         found = self._refined(pairs, grey.astype(float), self._ideal[rows, columns], prior, noise)
+        found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
+        found = _outermost(sorted(found, key=lambda f: -f.score))
         return self._decide(stamp_ns, pipe_id, found, prior)
 
     def _window(self, centre: Float) -> tuple[slice, slice]:
@@ -131,7 +134,14 @@ class OutlineFinder:
                 both.append(fits[key])
             if both[0] is not None and both[1] is not None:
                 found.append(_Found(pair, (both[0], both[1]), pair.score + _fit_score(both[0]) + _fit_score(both[1])))
-        return sorted(found, key=lambda f: -f.score)
+        return found
+
+    @staticmethod
+    def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
+        lines = np.array([fit.line for fit in found.fits])
+        feet = np.array([fit.foot_px for fit in found.fits])
+        score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
+        return replace(found, score=found.score + score)
 
     def _decide(self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior) -> OutlineSighting | Rejection:
         if not found:
@@ -169,9 +179,24 @@ class OutlineFinder:
         return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
 
 
+def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
+    """Lowers hypotheses that lie within another one about the same middle: a highlight has two edges as well."""
+    result = []
+    for inner in found:
+        nested = any(
+            outer.pair.width_px > inner.pair.width_px + 3.0
+            and abs(outer.pair.middle_px - inner.pair.middle_px) < 2.0
+            and outer.score > inner.score - 4.0
+            for outer in found
+        )
+        result.append(replace(inner, score=inner.score - penalty * nested))
+    return sorted(result, key=lambda f: -f.score)
+
+
 def _fit_score(fit: EdgeFit) -> float:
-    """Agreement of an edge with one sharp straight step: share of good stretches, and blur (a highlight is soft)."""
-    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * (max(np.log(fit.blur_px / 0.8), 0.0) / 0.3) ** 2
+    """Agreement of an edge with one sharp straight step: share of good stretches; shading and highlights are soft."""
+    soft = max(0.55 - fit.sharpness, 0.0) / 0.12
+    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * soft**2
 
 
 def silhouette_sighting(
