@@ -40,9 +40,7 @@ class _Lens:
     """The distorted radius there."""
 
 
-def undistort(
-    camera: CameraModel, raw_px: Float, covariance_px2: Float | None = None
-) -> tuple[Float, Float | None]:
+def undistort(camera: CameraModel, raw_px: Float, covariance_px2: Float | None = None) -> tuple[Float, Float | None]:
     """Ideal pixels of raw ones, with the covariance carried over by the Jacobian.
 
     Args:
@@ -123,7 +121,9 @@ def _lens(model: str, D: tuple[float, ...], name: str) -> _Lens | None:
     if fisheye and not D:
         trimmed = (0.0,) * 4
     if len(trimmed) not in lengths or not np.isfinite(trimmed).all():
-        raise SurecutError(f"camera {name}: {model} with {len(D)} coefficients {list(D)}; it takes {lengths[-1]} numbers")
+        raise SurecutError(
+            f"camera {name}: {model} with {len(D)} coefficients {list(D)}; it takes {lengths[-1]} numbers"
+        )
     if fisheye:
         return _with_limits(True, trimmed, (), (0.0, 0.0), (0.0,) * 4)
     k = (*trimmed, *([0.0] * (12 - len(trimmed))))

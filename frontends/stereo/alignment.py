@@ -68,14 +68,13 @@ class Alignment:
 
 
 class PatchGrid:
-    """Sample places and weights of a square patch."""
+    """Sample places and weights of a square patch: `radius` samples to each side, `spacing_px` apart."""
 
-    def __init__(self, radius_px: int) -> None:
-        axis = np.arange(-radius_px, radius_px + 1, dtype=np.float64)
+    def __init__(self, radius: int, spacing_px: float = 1.0) -> None:
+        axis = np.arange(-radius, radius + 1, dtype=np.float64) * spacing_px
         u, v = np.meshgrid(axis, axis)
-        self.radius = radius_px
         self.offsets = np.stack((u.ravel(), v.ravel()), axis=1)
-        weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius_px + 0.5)) ** 2)
+        weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
         self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
@@ -96,13 +95,16 @@ class PatchGrid:
         return centred, deviation
 
 
+def no_patches(grid: PatchGrid) -> Patches:
+    """No patch at all."""
+    m = len(grid.weights)
+    return Patches(np.zeros((0, m), np.float32), np.zeros((0, 2, m), np.float32), np.zeros((0, 2, 2)), np.zeros(0))
+
+
 def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
     """Reference patches (n) about `px` (n, 2) of a smoothed image."""
     if len(px) == 0:
-        m = len(grid.weights)
-        return Patches(
-            np.zeros((0, m), np.float32), np.zeros((0, 2, m), np.float32), np.zeros((0, 2, 2)), np.zeros(0)
-        )
+        return no_patches(grid)
     values, deviation = grid.normalise(grid.sample(image, px))
     shift = np.array([[0.5, 0.0], [0.0, 0.5]])
     gradient = np.stack(
@@ -123,7 +125,13 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
 
 
 def align(
-    image: Float32, patches: Patches, guess: Float, linear: Float, grid: PatchGrid, iterations: int = 6
+    image: Float32,
+    patches: Patches,
+    guess: Float,
+    linear: Float,
+    grid: PatchGrid,
+    iterations: int = 6,
+    reach_px: float = 3.0,
 ) -> Alignment:
     """Places (n, 2) in a smoothed image where the reference patches fit best, near `guess` (n, 2).
 
@@ -134,6 +142,7 @@ def align(
         linear: (n, 2, 2), derivative of this image's pixels by the reference's.
         grid: the grid that the patches were made with.
         iterations: upper limit of Gauss-Newton steps.
+        reach_px: a patch that went farther from its guess has not converged.
     """
     px = guess.copy()
     n = len(px)
@@ -158,7 +167,7 @@ def align(
     raw_variance = mean_square * patches.contrast**2
     covariance = raw_variance[:, None, None] * (linear @ patches.inverse_hessian @ linear.transpose(0, 2, 1))
     moved = np.linalg.norm(px - guess, axis=1)
-    converged = visible & ~active & (moved < 3.0)
+    converged = visible & ~active & (moved < reach_px)
     return Alignment(px, correlation, covariance.astype(np.float64), converged)
 
 

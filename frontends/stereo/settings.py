@@ -36,6 +36,10 @@ class StereoSettings:
     min_inliers: int = 12
     min_spread: float = 0.03
     """Smallest standard deviation of the inliers, in the direction of least spread, as a share of the diagonal."""
+    min_relocalisation: int = 15
+    """Inliers that a remembered place needs to count as found again."""
+    revisits: int = 80
+    """Number of old landmarks that each keyframe looks for."""
     store_keyframes: int = 400
     """Number of keyframes that are remembered for relocalisation."""
     store_landmarks: int = 20000
