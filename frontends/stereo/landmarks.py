@@ -42,12 +42,6 @@ def _mosaic(tiles: Image) -> tuple[Float32, Float]:
     return tiles.reshape(n * side, side).astype(np.float32), centres
 
 
-def fine_patches(tiles: Image, grid: PatchGrid) -> Patches:
-    """Reference patches made anew from crops."""
-    image, centres = _mosaic(tiles)
-    return make_patches(image, centres, grid)
-
-
 @dataclass(frozen=True, slots=True)
 class Candidates:
     """Stored landmarks that should be in view."""
@@ -138,6 +132,7 @@ class LandmarkStore:
         rig: StereoGeometry,
         grid: PatchGrid,
         min_correlation: float,
+        variance: float,
     ) -> tuple[Float, Patches, Bool]:
         """Left raw pixels (n, 2) of the candidates, their fine patches, and which were found.
 
@@ -150,7 +145,7 @@ class LandmarkStore:
         # Each tile is low-passed by itself: the mosaic's seams lie beyond the coarse patch.
         coarse = make_patches(_low_pass(tiles), centres, _COARSE_GRID)
         first = align(smooth(image, _COARSE_SMOOTHING_PX), coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
-        fine = make_patches(tiles, centres, grid)
+        fine = make_patches(tiles, centres, grid, variance)
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
         second = align(smoothed, fine, start, warp, grid)
         return second.px, fine, second.converged & (second.correlation > min_correlation)

@@ -33,6 +33,10 @@ class NoiseModel:
         """Variance of a pixel that plain flow delivers, px^2."""
         return 0.2**2 * self._flow_gain
 
+    def mismatch(self, noise: float) -> float:
+        """Expected variance between a patch and its reference, in squared grey values."""
+        return 2.0 * (0.4 * noise) ** 2 if np.isnan(self._mismatch) else self._mismatch
+
     def aligned(self, structural: Float) -> Float:
         """Covariances (n, 2, 2) of aligned positions from the alignment's own ones."""
         return self._gain * (structural + _FLOOR_PX**2 * np.eye(2))

@@ -35,11 +35,15 @@ class Observer:
 
     def __init__(self, rig: StereoGeometry, noise: NoiseModel, settings: StereoSettings) -> None:
         self._rig, self._noise, self._settings = rig, noise, settings
-        self.grid = PatchGrid(settings.patch_radius_px)
+        self.grid = PatchGrid(settings.patch_radius_px, affine=settings.affine, stiffness=settings.stiffness)
 
     def view(self, pair: StereoPair) -> Keyview:
         """The pair with its smoothed images."""
         return Keyview(pair, *pair.smooth(self._settings.smoothing_px))
+
+    def mismatch(self, view: Keyview) -> float:
+        """Expected variance between a patch and its reference, in squared grey values."""
+        return self._noise.mismatch(view.pair.noise)
 
     def accepts(self, alignment: Alignment) -> Bool:
         """Which patches look like their reference."""
@@ -86,7 +90,7 @@ class Observer:
         ideal = undistort(self._rig.left, raw_px)[0]
         valid = np.isfinite(ideal).all(axis=1)
         raw_px, ideal = raw_px[valid], ideal[valid]
-        patches = make_patches(view.left, raw_px, self.grid)
+        patches = make_patches(view.left, raw_px, self.grid, self.mismatch(view))
         ids: Int = np.arange(first_id, first_id + len(raw_px), dtype=np.int64)
         tracks = new_tracks(ids, raw_px, ideal, patches, crops(view.left, raw_px, CROP_GRID), chain_T_this)
         start = search_right(

@@ -14,8 +14,10 @@ class StereoSettings:
     flow_window_px: int = 15
     pyramid_levels: int = 3
     forward_backward_px: float = 0.7
-    patch_radius_px: int = 6
+    patch_radius_px: int = 7
     """Half size of the square patch that alignment compares."""
+    affine: bool = True
+    stiffness: float = 2.5
     smoothing_px: float = 0.7
     """Standard deviation of the Gaussian ahead of alignment; it takes the bias of bilinear sampling away."""
     min_correlation: float = 0.8
