@@ -1,0 +1,1 @@
+"""The commands that rest on the estimator."""
