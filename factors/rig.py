@@ -157,8 +157,8 @@ class Gates(Section):
     """When a measurement is refused (chi-square probabilities) and how hard large residuals are softened."""
 
     gate_probability: Annotated[float, Field(gt=0, lt=1)] = 1e-4
-    robust_sigma: Positive = 1.8
-    """Scale of the robust loss, in sigmas."""
+    robust_sigma: Positive = 2.5
+    """Where the robust loss begins, in sigmas of one dimension; more dimensions: the same probability."""
 
 
 class Box(Section):

@@ -1,1 +1,1 @@
-"""The commands that rest on the estimator."""
+"""The commands of the command line: each translates arguments and calls a function that can be imported."""
