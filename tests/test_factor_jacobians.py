@@ -37,7 +37,7 @@ def numeric_jacobian(factor, values, key, dim):
 def retracted_all(values, factor, key, delta):
     step = values.zeroVectors()
     full = gtsam.VectorValues()
-    for k in values.keys():  # noqa: SIM118 - gtsam's Values is no mapping
+    for k in values.keys():
         full.insert(k, delta if k == key else step.at(k))
     return values.retract(full)
 
@@ -45,9 +45,9 @@ def retracted_all(values, factor, key, delta):
 def check(factor, values, whiten):
     gaussian_factor = factor.linearize(values)
     A, _ = gaussian_factor.jacobian()
-    dims = {k: values.zeroVectors().at(k).size for k in values.keys()}  # noqa: SIM118
+    dims = {k: values.zeroVectors().at(k).size for k in values.keys()}
     column = 0
-    for key in gaussian_factor.keys():  # noqa: SIM118
+    for key in gaussian_factor.keys():
         dim = dims[key]
         expected = whiten(numeric_jacobian(factor, values, key, dim))
         np.testing.assert_allclose(A[:, column : column + dim], expected, atol=2e-5 * max(1, np.abs(expected).max()))
