@@ -65,7 +65,13 @@ class Pipeline:
     def _plain(self, message: Message) -> Message:
         """A compressed topic counts as its raw one."""
         if message.topic.endswith(COMPRESSED):
-            return Message(message.topic.removesuffix(COMPRESSED), message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
+            return Message(
+                message.topic.removesuffix(COMPRESSED),
+                message.log_time_ns,
+                message.stamp_ns,
+                message.frame_id,
+                message.body,
+            )
         return message
 
     def process(self, group: list[Item]) -> None:
@@ -146,7 +152,9 @@ class Pipeline:
             if pick.role in AXIS_ROLES and pick.camera in ("m_left", "m_right"):
                 pipe = self.engine.pipes.pipe_of(pick.point_id)
                 finder = self.sensors.outline_finder(pick.camera)
-                self._take(finder.near_pick(pair.stamp_ns, pipe, pair.of(pick.camera), pick.px))
+                click = float(np.sqrt(pick.covariance_px2.trace() / 2))
+                prior = OutlinePrior(pick.px, click)
+                self._take(finder.find(pair.stamp_ns, pipe, pair.of(pick.camera), prior))
                 self._looked.setdefault(f"{pipe} {pick.camera}", set()).add(pair.stamp_ns)
         self.engine.flush()
         for pipe in list(self.engine.pipes.cylinders):
@@ -200,7 +208,7 @@ def _outline_prior(
             continue
         half = float(K[0, 0] * axis[2] / np.sqrt(max(a[2] ** 2 - axis[2] ** 2, 1e-6)))
         angle = float(np.arctan2(pb[1] - pa[1], pb[0] - pa[0]))
-        return OutlinePrior(pa, 4.0, half, 0.15 * half + 0.5, angle, np.deg2rad(6.0))
+        return OutlinePrior(pa, 1.5, half, 0.15 * half + 0.5, angle, np.deg2rad(6.0))
     return None
 
 

@@ -49,4 +49,3 @@ def estimate(
     for bundle in bundles(list(measurements)):
         engine.add(bundle)
     return finish(engine, between)
-

@@ -36,7 +36,9 @@ class Patches:
 
     def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
         """The patches at the given indices or of the given mask."""
-        return Patches(self.values[index], self.steps[index], self.normal[index], self.inverse_hessian[index], self.contrast[index])
+        return Patches(
+            self.values[index], self.steps[index], self.normal[index], self.inverse_hessian[index], self.contrast[index]
+        )
 
     def append(self, other: "Patches") -> "Patches":
         """These patches followed by others."""
@@ -103,8 +105,14 @@ class PatchGrid:
 def no_patches(grid: PatchGrid) -> Patches:
     """No patch at all."""
     m = len(grid.weights)
-    k=6 if grid.affine else 2
-    return Patches(np.zeros((0, m), np.float32), np.zeros((0, k, m), np.float32), np.zeros((0,k,k)), np.zeros((0, 2, 2)), np.zeros(0))
+    k = 6 if grid.affine else 2
+    return Patches(
+        np.zeros((0, m), np.float32),
+        np.zeros((0, k, m), np.float32),
+        np.zeros((0, k, k)),
+        np.zeros((0, 2, 2)),
+        np.zeros(0),
+    )
 
 
 def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
@@ -124,16 +132,24 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0
     jacobian = gradient
     if grid.affine:
         u, v = grid.offsets.T.astype(np.float32)
-        jacobian = np.concatenate((gradient, gradient[:, :1] * u, gradient[:, :1] * v, gradient[:, 1:] * u, gradient[:, 1:] * v), axis=1)
+        jacobian = np.concatenate(
+            (gradient, gradient[:, :1] * u, gradient[:, :1] * v, gradient[:, 1:] * u, gradient[:, 1:] * v), axis=1
+        )
     size = jacobian.shape[1]
     weighted = jacobian * grid.weights
     hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-    stiffness = np.clip(variance / deviation.astype(np.float64)**2 * grid.stiffness, 0.002, 2.0)
+    stiffness = np.clip(variance / deviation.astype(np.float64) ** 2 * grid.stiffness, 0.002, 2.0)
     hessian += stiffness[:, None, None] * np.diag(np.r_[0.0, 0.0, np.ones(size - 2)]) + 1e-9 * np.eye(size)
     inverse = np.linalg.inv(hessian)
     steps = inverse.astype(np.float32) @ weighted
     spread = (steps[:, :2] @ steps[:, :2].transpose(0, 2, 1)).astype(np.float64)
-    return Patches(values, steps, inverse * stiffness[:, None, None], spread / (deviation.astype(np.float64) ** 2)[:, None, None], deviation.astype(float))
+    return Patches(
+        values,
+        steps,
+        inverse * stiffness[:, None, None],
+        spread / (deviation.astype(np.float64) ** 2)[:, None, None],
+        deviation.astype(float),
+    )
 
 
 def align(

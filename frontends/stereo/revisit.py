@@ -51,7 +51,14 @@ def revisit(
     here = transform(inverse(chain_T_this), store.points[rows])
     candidates = Candidates(rows, here, distort(rig.left, project(here, rig.left)))
     raw_px, patches, found = store.find_left(
-        view.pair.left, view.left, candidates, chain_T_this, rig, observer.grid, settings.min_correlation, observer.mismatch(view)
+        view.pair.left,
+        view.left,
+        candidates,
+        chain_T_this,
+        rig,
+        observer.grid,
+        settings.min_correlation,
+        observer.mismatch(view),
     )
     left_px = undistort(rig.left, raw_px)[0]
     found &= np.isfinite(left_px).all(axis=1)
