@@ -36,7 +36,7 @@ def protobuf_decoder(channel: ChannelInfo) -> Decoder:
         parse = DecoderFactory().decoder_for("protobuf", schema)
     except Exception as error:  # protobuf's own, for bytes that may be anything
         raise LogError(
-            f"{channel.topic}: the definition of {channel.schema_name} in the log is not understood ({in_one_line(error)})"
+            f"{channel.topic}: the log's definition of {channel.schema_name} is not understood ({in_one_line(error)})"
         ) from error
     assert parse is not None
     make = BODIES.get(channel.schema_name)

@@ -176,10 +176,8 @@ def test_messages_that_rosbag2_compressed_one_by_one():
 
 def test_older_type_names_and_missing_definitions():
     data = cdr("geometry_msgs/msg/PoseStamped", build.pose_stamped(TIME, "o", np.eye(4)))
-    for name, text in (
-        ("geometry_msgs/PoseStamped", schema("geometry_msgs/msg/PoseStamped").text),
-        ("geometry_msgs/msg/PoseStamped", ""),
-    ):
+    text = schema("geometry_msgs/msg/PoseStamped").text
+    for name, definition in (("geometry_msgs/PoseStamped", text), ("geometry_msgs/msg/PoseStamped", "")):
         message = decoder_for(ChannelInfo("/t", "cdr", name, "ros2msg", definition.encode()))(data, 1)
         assert isinstance(message.body, PoseBody)
 
