@@ -13,7 +13,7 @@ from .decode import ChannelInfo, DecodeError, Decoder, decoder_for
 from .messages import Message, OtherBody
 from .records import RawMessage, Record
 from .sources import Part, parts_of
-from .summary import Summary
+from .summary import EMPTY, Summary
 
 
 class LogReader:
@@ -73,7 +73,7 @@ class LogReader:
     def raw(self) -> Iterator[tuple[ChannelInfo, int, bytes | memoryview]]:
         """Channel, log time (ns) and undecoded data of every message, of all topics."""
         part: Part | None = None
-        describe = _Descriptions(Summary({}, {}, {}, None))
+        describe = _Descriptions(EMPTY)
         for at, record in self._records():
             if at is not part:  # numbers of channels and schemas are those of one file
                 part, describe = at, _Descriptions(at.summary())

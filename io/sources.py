@@ -13,7 +13,7 @@ from mcap.records import Attachment
 
 from ..factors.errors import LogError
 from .records import Record, RecordStream
-from .summary import Summary, find_attachment, read_summary
+from .summary import EMPTY, Summary, find_attachment, read_summary
 
 
 class Part:
@@ -43,7 +43,7 @@ class Part:
         """
         with self._opened() as file:
             size = self.path.stat().st_size if self.path is not None and self.seekable else None
-            self._records = RecordStream(file, self.label, size)
+            self._records = RecordStream(file, self.label, size, self.summary().has_data_crc)
             try:
                 yield from self._records
                 if self._stream is None:
@@ -58,7 +58,7 @@ class Part:
     def summary(self) -> Summary:
         """Descriptions from the end of a file, empty where there are none."""
         if not self.seekable or self.path is None:
-            return Summary({}, {}, {}, None)
+            return EMPTY
         with self.path.open("rb") as file:
             return read_summary(file)
 

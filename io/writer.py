@@ -75,6 +75,7 @@ class McapSink:
             compression=_COMPRESSION[compression],
             chunk_size=chunk_size or 1,
             use_chunking=chunk_size is not None,
+            enable_data_crcs=chunk_size is None,  # chunks have checksums of their own
         )
         try:
             with self._told():

@@ -249,6 +249,17 @@ def test_any_flipped_bit_gives_no_wrong_message(tmp_path: Path):
     assert unread < 10
 
 
+def test_a_flipped_bit_outside_chunks_is_told(open_log: Open, tmp_path: Path):
+    path = tmp_path / "log.mcap"
+    logmaker.write_log(path, 5, chunk_size=None)
+    data = bytearray(path.read_bytes())
+    data[data.index(logmaker.picture(3).tobytes()) + 99] ^= 1
+    path.write_bytes(data)
+    with open_log(path) as reader:
+        assert sum(counts(reader).values()) == 5 * 18
+        assert "the checksum over all records differs" in reader.warnings[0]
+
+
 def test_the_next_chunk_is_found_after_a_broken_length(open_log: Open, tmp_path: Path):
     whole = tmp_path / "whole.mcap"
     logmaker.write_log(whole, 20, chunk_size=40_000, compression="zstd", rig=None)
