@@ -32,8 +32,7 @@ class _Log:
     def __init__(self, inventory: Inventory, rig: Rig | None) -> None:
         self.inventory = inventory
         self.rig = rig
-        # the defaults of the rig file, read without a rig: `boards` alone has none
-        self.names = rig if rig is not None else Rig.model_construct()
+        self.names = rig if rig is not None else Rig()
 
     def names_of(self, camera: str) -> Camera:
         return getattr(self.names.cameras, camera)
