@@ -21,6 +21,8 @@ _FARTHEST_PX = 1.5
 """The fit may move the line so far; the seed is better than that."""
 _KINKS_PX = (0.0, 1.8, 3.2)
 """Depths at which the shading may change its slope."""
+_WIDE, _NARROW = (4.5, 5.0), (3.0, 2.5)
+"""How far outside and inside the edge a fit looks, px."""
 _SHADING_RANGE = 100.0
 """Prior sigma of a shading term, grey values over half the pipe's width."""
 
@@ -114,14 +116,24 @@ def fit_edge(
     Returns:
         None where the grey values do not hold such an edge.
     """
-    pixels = _gather(grey, px, line, foot_px, span, half_width_px, noise)
-    if pixels is None:
-        return None
-    start = np.zeros(1 + len(_KINKS_PX))
-    state, weights = _State(0.0, 0.0, float(np.log(0.6)), start), np.ones(len(pixels.grey))
+    fits = []
+    for window in (_WIDE, _NARROW):
+        pixels = _gather(grey, px, line, foot_px, span, half_width_px, noise, window)
+        state = None if pixels is None else _converged(pixels)
+        if pixels is None or state is None:
+            return None
+        fits.append((pixels, state))
+    (pixels, state), (_, other) = fits
+    # What the two windows do not agree on is the model's error, not noise.
+    spread = np.diag([(state.offset - other.offset) ** 2, (state.turn - other.turn) ** 2])
+    return _result(line, foot_px, pixels, state, spread)
+
+
+def _converged(pixels: _Pixels) -> _State | None:
+    state, weights = _State(0.0, 0.0, float(np.log(0.6)), np.zeros(1 + len(_KINKS_PX))), np.ones(len(pixels.grey))
     for iteration in range(_ITERATIONS):
         linear = _linearise(pixels, state)
-        weights = _weights(linear) if iteration >= 2 else np.ones(len(pixels.grey))
+        weights = _weights(linear) if iteration >= 2 else weights
         if weights.sum() < 1.5:
             return None
         normal, scores = _normal(linear, weights, _prior(iteration // 3))
@@ -134,22 +146,23 @@ def fit_edge(
             return None
         if iteration > 6 and abs(step[0]) < 2e-3 and abs(step[1]) < 1e-4:
             break
-    linear = _linearise(pixels, state)
-    return _result(line, foot_px, pixels, state, linear, _weights(linear))
+    return state
 
 
 def _gather(
-    grey: Float, px: Float, line: Float, foot_px: Float, span: tuple[float, float], half_width_px: float, noise: float
+    grey: Float, px: Float, line: Float, foot_px: Float, span: tuple[float, float], half_width_px: float, noise: float,
+    window: tuple[float, float],
 ) -> _Pixels | None:
-    inside = float(np.clip(0.8 * half_width_px, 2.0, 5.0)) + 0.5
+    outside, deepest = window
+    inside = float(np.clip(0.8 * half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
     along = (px - foot_px) @ np.array([-line[1], line[0]])
-    keep = (depth > -4.5) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
+    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
     grey, depth, along = grey[keep], depth[keep], along[keep]
     number = max(1, round((span[1] - span[0]) / _STRETCH_PX))
     stretch = np.minimum(((along - span[0]) / (span[1] - span[0]) * number).astype(int), number - 1)
     count = np.bincount(stretch, minlength=number)
-    full = count >= 0.6 * _STRETCH_PX * (inside + 4.5)
+    full = count >= 0.6 * _STRETCH_PX * (inside + outside)
     if full.sum() < 2:
         return None
     order = np.argsort(stretch, kind="stable")
@@ -254,8 +267,10 @@ def _larger(a: Float, b: Float) -> Float:
 
 
 def _result(
-    line: Float, foot_px: Float, pixels: _Pixels, state: _State, linear: _Linear, weights: Float
+    line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float
 ) -> EdgeFit | None:
+    linear = _linearise(pixels, state)
+    weights = _weights(linear)
     good = (linear.shift_sigma < 0.5) & (weights > 0.1)
     if good.sum() < 2:
         return None
@@ -269,7 +284,7 @@ def _result(
     return EdgeFit(
         line=np.array([normal[0], normal[1], -normal @ foot]),
         foot_px=foot,
-        covariance=_covariance(linear, weights),
+        covariance=_covariance(linear, weights) + spread,
         extent=(float(start), float(end)),
         blur_px=float(np.exp(state.log_blur)),
         contrast=contrast,
@@ -288,8 +303,9 @@ def _sharpness(pixels: _Pixels, state: _State, good: NDArray[np.bool_]) -> tuple
         near = weight * (np.abs(depth - middle) < 0.6)
         count = near.sum(axis=1)
         means.append(np.where(count > 0, (grey * near).sum(axis=1) / np.maximum(count, 1), np.nan))
-    with np.errstate(invalid="ignore"):
-        edge, beyond = (float(np.nanmedian(np.abs(means[i + 1] - means[i]))) for i in (0, 1))
-    if not np.isfinite(edge + beyond):
+    changes = [np.abs(means[i + 1] - means[i]) for i in (0, 1)]
+    changes = [c[np.isfinite(c)] for c in changes]
+    if not all(len(c) for c in changes):
         return 0.0, 0.0
+    edge, beyond = (float(np.median(c)) for c in changes)
     return edge, edge / max(edge + beyond, 1e-9)
