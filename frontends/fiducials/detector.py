@@ -17,7 +17,7 @@ from .search import Candidate, MarkerSearch
 
 Float = NDArray[np.float64]
 
-CORNER_FLOOR_PX = 0.01
+CORNER_FLOOR_PX = 0.006
 """What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
 _MIN_CORRELATION = 0.80
 """Pixels with the fitted pattern, for a marker that was read."""
@@ -25,6 +25,9 @@ _MIN_CORRELATION_PREDICTED = 0.90
 """The same for one that was only expected there."""
 _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
+_MIN_SHARE = 0.5
+"""Of the pattern's edges, what has to be seen as the model says."""
+_SETTLED_PX = 0.1
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
 
@@ -205,6 +208,10 @@ def _judged(candidate: Candidate, start: Float, fit: PatternFit, k: int, cells: 
         problem = ("contrast in grey values", float(fit.contrast[k]), _MIN_CONTRAST)
     elif fit.correlation[k] < min_correlation:
         problem = ("correlation with the pattern", float(fit.correlation[k]), min_correlation)
+    elif fit.share[k] < _MIN_SHARE:
+        problem = ("share of the edges that fit", float(fit.share[k]), _MIN_SHARE)
+    elif fit.last_step_px[k] > _SETTLED_PX:
+        problem = ("the fit did not settle, last step in px", float(fit.last_step_px[k]), _SETTLED_PX)
     elif moved > 1.5:
         problem = ("the fit left the marker, move in cells", moved, 1.5)
     return _Fitted(candidate, corners, covariance, float(fit.correlation[k]), float(fit.contrast[k]), problem)

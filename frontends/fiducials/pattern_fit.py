@@ -24,7 +24,7 @@ Single = NDArray[np.float32]
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 _MAX_PIXELS = 512
 """Pixels per marker; more cost time and give nothing that the model's own error does not swamp."""
-_FEW_PIXELS = 160
+_FEW_PIXELS = 200
 """Of them, those that the first steps use."""
 _LATTICE = 3000
 """Pixels of a marker that are looked at to choose from."""
@@ -33,11 +33,14 @@ _REACH_PX = 3.0
 _MARGIN_CELLS = 0.9
 """How far outside the border the page is taken to be white."""
 _BLUR_RANGE_PX = (0.25, 4.0)
+_COARSE_BLUR_PX = 0.8
+"""Least blur of the first stage: with a sharper model too few of its pixels would feel the edges."""
+_STEP_PX = 1.0
 _BLUR_STEP_PX2 = 2.0
 _COARSE_PX, _FINE_PX = 0.15, 0.03
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
-_FORGIVEN_PX = 0.15
-"""Edges may be that far off, beside the noise, before their pixels lose weight."""
+_COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
+"""Edges may be that far off, beside the noise, before their pixels lose weight, in either stage."""
 _ROUNDING = np.sqrt(1.0 / 12.0)
 """Standard deviation of the rounding to whole grey values."""
 _INV_SQRT_2PI = np.float32(1.0 / np.sqrt(2.0 * np.pi))
@@ -61,6 +64,10 @@ class PatternFit:
     """Shape (m,), rms of the residuals in grey values, robust."""
     correlation: Float
     """Shape (m,), of the pixels with the model."""
+    share: Float
+    """Shape (m,), of the weight of the edges, what the robust fit has kept; small where the pattern is covered."""
+    last_step_px: Float
+    """Shape (m,), what the last step moved a corner by; large where the fit did not settle."""
     noise_factor: Float
     """Shape (m,), how much residuals that hang together raise the variance over white noise of the same size."""
 
@@ -294,9 +301,8 @@ def fit_patterns(
     few = pixels.first(_FEW_PIXELS)
     centred = corners - pixels.origin[:, None]
     blur = np.tile([blur_px**2, blur_px**2, 0.0], (len(corners), 1))
-    cell_px = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=1) / (np.sqrt(2.0) * cells)
-    state, _ = _descend(_State(centred, blur, None), few, D, lines, cell_px, steps, _COARSE_PX)
-    state, solved = _descend(state, pixels, D, lines, cell_px, steps, _FINE_PX)
+    state, _ = _descend(_State(centred, blur, None), few, D, lines, steps, True)
+    state, solved = _descend(state, pixels, D, lines, steps, False)
     return _summary(state, solved, pixels)
 
 
@@ -321,9 +327,9 @@ class _Solved:
 
 
 def _descend(
-    state: _State, pixels: _Pixels, D: Single, lines: Single, cell_px: Float, steps: int, enough_px: float
+    state: _State, pixels: _Pixels, D: Single, lines: Single, steps: int, coarse: bool
 ) -> tuple[_State, _Solved]:
-    """Gauss-Newton on each marker until none of its corners moves by more than `enough_px`."""
+    """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for."""
     m, n = pixels.value.shape
     corners, blur = state.corners.copy(), state.blur.copy()
     light = np.zeros((m, 10)) if state.light is None else state.light.copy()
@@ -334,24 +340,25 @@ def _descend(
         np.zeros((m, n), np.float32),
         np.zeros((m, n, 8), np.float32),
     )
+    forgiven = _COARSE_FORGIVEN_PX if coarse else _FORGIVEN_PX
     active = np.arange(m)
     for count in range(steps):
         lit = None if count == 0 and state.light is None else light[active]
-        one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines)
+        one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines, forgiven)
         largest = np.abs(one.step[:, :8]).max(1)
-        shrink = np.minimum(1.0, cell_px[active] / np.maximum(largest, 1e-9))
+        shrink = np.minimum(1.0, _STEP_PX / np.maximum(largest, 1e-9))
         corners[active] += (one.step[:, :8] * shrink[:, None]).reshape(-1, 4, 2)
-        blur[active] = _bounded(blur[active], one.step[:, 8:11])
+        blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
         light[active] = one.step[:, 11:]
         for name in ("step", "inverse", "residual", "weight", "jacobian"):
             getattr(solved, name)[active] = getattr(one, name)
-        active = active[largest > enough_px]
+        active = active[largest > (_COARSE_PX if coarse else _FINE_PX)]
         if not len(active):
             break
     return _State(corners, blur, light), solved
 
 
-def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single) -> _Solved:
+def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single, forgiven_px: float) -> _Solved:
     """One Gauss-Newton step of corners and blur, with new light, outlying pixels softened.
 
     The very first step (no light yet) finds the light beforehand and softens nothing: everything is off then.
@@ -372,7 +379,7 @@ def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single) -> _Solved:
     columns[..., 8:11] = gain[..., None] * model.by_blur
     if state.light is not None:
         slope = gain * np.sqrt(np.einsum("mni,mni->mn", model.gradient, model.gradient))
-        weight = weight * _softened(residual, _robust_scale(residual, weight), slope)
+        weight = weight * _softened(residual, _robust_scale(residual, weight), forgiven_px * slope)
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
     step[:, 11:] += light
@@ -390,12 +397,12 @@ def _by_corners(H: Float, model: _Model, xy: Single, gain: Single) -> Single:
     return by_H @ _corner_basis(H).astype(np.float32)
 
 
-def _bounded(blur: Float, step: Float) -> Float:
+def _bounded(blur: Float, step: Float, least_px: float) -> Float:
     """The blur after a step, its widths kept within what lenses and hands do."""
     new = blur + np.clip(step, -_BLUR_STEP_PX2, _BLUR_STEP_PX2)
     matrix = new[:, [[0, 2], [2, 1]]]
     values, vectors = np.linalg.eigh(matrix)
-    values = np.clip(values, _BLUR_RANGE_PX[0] ** 2, _BLUR_RANGE_PX[1] ** 2)
+    values = np.clip(values, least_px**2, _BLUR_RANGE_PX[1] ** 2)
     matrix = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
     return np.stack([matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 0, 1]], -1)
 
@@ -424,9 +431,9 @@ def _robust_scale(residual: Single, weight: Single) -> Float:
     return 1.4826 * np.where(count > 0, median, 0.0) + _ROUNDING
 
 
-def _softened(residual: Single, scale: Float, slope: Single) -> Single:
+def _softened(residual: Single, scale: Float, forgiven: Single) -> Single:
     """Tukey-like weights: whole up to 2.5 sigma, nothing beyond 6, an edge that is a little off forgiven."""
-    allowed = (_FORGIVEN_PX * slope) ** 2 + (scale.astype(np.float32) ** 2)[:, None]
+    allowed = forgiven**2 + (scale.astype(np.float32) ** 2)[:, None]
     return np.clip((6.0 - np.abs(residual) / np.sqrt(allowed)) / 3.5, 0.0, 1.0)
 
 
@@ -441,7 +448,7 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
 def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
     weight, light = solved.weight, solved.step[:, 11:]
     freedom = np.maximum(weight.sum(1) - 21.0, 1.0)
-    variance = (solved.residual**2 * weight).sum(1) / freedom + _ROUNDING**2
+    variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
     factor = _hang_together(solved, pixels, weight)
     covariance = solved.inverse[:, :8, :8] * (variance * factor)[:, None, None]
     return PatternFit(
@@ -451,19 +458,32 @@ def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
         light[:, 1],
         np.sqrt(variance),
         _correlation(pixels.value, solved.residual, weight),
+        _share(solved, pixels),
+        np.abs(solved.step[:, :8]).max(1),
         factor,
     )
 
 
+def _share(solved: _Solved, pixels: _Pixels) -> Float:
+    strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian)
+    whole = (strength * pixels.weight).sum(1)
+    return ((strength * solved.weight).sum(1) / np.maximum(whole, 1e-9)).astype(float)
+
+
 def _hang_together(solved: _Solved, pixels: _Pixels, weight: Single) -> Float:
-    """Variance of the sums of residuals over small blocks against that of independent ones, at least 1, shape (m,)."""
+    """Variance of the sums of residuals over small blocks against that of independent ones, shape (m,).
+
+    1 where it is no larger than chance makes it.
+    """
     m = len(weight)
     blocks = int(pixels.block.max(initial=0)) + 1
     place = (pixels.block + blocks * np.arange(m)[:, None]).ravel()
     score = ((solved.residual * weight)[..., None] * solved.jacobian).astype(float)
     apart = (score**2).sum((1, 2))
-    together = np.zeros(m)
+    together, used = np.zeros(m), np.zeros(m)
     for k in range(8):
-        sums = np.bincount(place, score[..., k].ravel(), minlength=m * blocks)
-        together += (sums**2).reshape(m, blocks).sum(1)
-    return np.maximum(1.0, together / np.maximum(apart, 1e-12))
+        sums = np.bincount(place, score[..., k].ravel(), minlength=m * blocks).reshape(m, blocks) ** 2
+        together += sums.sum(1)
+        used = np.maximum(used, sums.sum(1) ** 2 / np.maximum((sums**2).sum(1), 1e-12))
+    factor = together / np.maximum(apart, 1e-12)
+    return np.where(factor > 1.0 + 2.0 * np.sqrt(2.0 / np.maximum(used, 1.0)), factor, 1.0)
