@@ -31,7 +31,7 @@ def point_covariance(points: Float, covariance: Float, rig: StereoGeometry) -> F
     """Covariance (n, 3, 3) of triangulated points from that of their pixels (n, 4, 4), first order."""
     jacobian = rig.jacobian(points)
     information = jacobian.transpose(0, 2, 1) @ np.linalg.inv(covariance) @ jacobian
-    return np.linalg.inv(information + 1e-12 * np.eye(3))
+    return np.asarray(np.linalg.inv(information + 1e-12 * np.eye(3)), dtype=np.float64)
 
 
 def estimate_motion(
@@ -122,7 +122,8 @@ class _Problem:
 
     def _information(self, pose: Float, here: Float) -> Float:
         jacobian = self._jacobian(here) @ pose[:3, :3].T
-        return np.linalg.inv(self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1))
+        covariance = self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1)
+        return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
     def chi2(self, pose: Float) -> Float:
         here = self._here(pose)
@@ -146,7 +147,8 @@ class _Problem:
             by_pose = np.concatenate((by_point @ _cross(here), -by_point), axis=2)
             weighted = (weight[:, None, None] * information) @ by_pose
             normal = weighted.reshape(-1, 6).T @ by_pose.reshape(-1, 6) + 1e-6 * np.eye(6)
-            step = np.linalg.solve(normal, weighted.reshape(-1, 6).T @ residual.ravel())
+            moment = weighted.reshape(-1, 6).T @ residual.ravel()
+            step = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
             pose = pose @ exponential(step)
             if np.linalg.norm(step[:3]) < 1e-6 and np.linalg.norm(step[3:]) < 1e-6:
                 break

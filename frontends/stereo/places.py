@@ -148,7 +148,8 @@ class PlaceStore:
 
 
 def _thumbnail(image: Image) -> Float32:
-    small = np.asarray(cv2.resize(cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80.0), _THUMBNAIL), np.float32)
+    small = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float32)
     small = small - small.mean()
     return small / max(float(np.linalg.norm(small)), 1e-6)
 

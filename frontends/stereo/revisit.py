@@ -51,7 +51,14 @@ def revisit(
     here = transform(inverse(chain_T_this), store.points[rows])
     candidates = Candidates(rows, here, distort(rig.left, project(here, rig.left)))
     raw_px, patches, found = store.find_left(
-        view.pair.left, view.left, candidates, chain_T_this, rig, observer.grid, settings.min_correlation, observer.mismatch(view)
+        view.pair.left,
+        view.left,
+        candidates,
+        chain_T_this,
+        rig,
+        observer.grid,
+        settings.min_correlation,
+        observer.mismatch(view),
     )
     left_px = undistort(rig.left, raw_px)[0]
     found &= np.isfinite(left_px).all(axis=1)
@@ -63,9 +70,9 @@ def revisit(
     store.missed(np.delete(rows, chosen))
     corrected = transform(inverse(motion.reference_T_this), here[chosen])
     tracks = store.revive(rows[chosen], raw_px[chosen], left_px[chosen], patches.take(chosen), corrected)
-    return _observe(
-        view, store, rows[chosen], tracks, chain_T_this @ motion.reference_T_this, observer, rig, vertical
-    ) + (motion.reference_T_this,)
+    pose = chain_T_this @ motion.reference_T_this
+    tracks, sighting = _observe(view, store, rows[chosen], tracks, pose, observer, rig, vertical)
+    return tracks, sighting, motion.reference_T_this
 
 
 def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | None:
