@@ -176,7 +176,7 @@ class StereoFrontEnd:
             tracks.points_covariance[usable],
             px[usable],
             covariance[usable],
-            guess,
+            (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
         )

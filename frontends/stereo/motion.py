@@ -1,5 +1,6 @@
 """Robust motion between two stereo frames: P3P consensus, then refinement in both cameras with covariances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -39,7 +40,7 @@ def estimate_motion(
     points_covariance: Float,
     px: Float,
     px_covariance: Float,
-    predicted: Float,
+    predicted: Sequence[Float],
     rig: StereoGeometry,
     min_inliers: int,
 ) -> Motion | None:
@@ -50,14 +51,15 @@ def estimate_motion(
         points_covariance: (n, 3, 3), m^2.
         px: (n, 4), ideal left and right pixels in this frame; the right ones may be NaN.
         px_covariance: (n, 4, 4), px^2.
-        predicted: (4, 4), `reference_T_this` as expected; competes with the consensus search.
+        predicted: poses (4, 4), `reference_T_this` as it may be; they compete with the consensus search, so that a
+            body that moves by itself has to hold more points than the rest to be followed.
         rig: nominal geometry.
         min_inliers: fewer give None.
     """
     if len(points) < max(min_inliers, 6):
         return None
     data = _Problem(points, points_covariance, px, px_covariance, rig)
-    candidates = [predicted]
+    candidates = list(predicted)
     consensus = _consensus(points, px[:, :2], rig)
     if consensus is not None:
         candidates.append(consensus)

@@ -135,7 +135,7 @@ class PlaceStore:
         covariance = lateral[:, None, None] * np.eye(3)
         both = np.hstack((px, np.full((n, 2), np.nan)))
         pixels = np.broadcast_to(1.5**2 * np.eye(4), (n, 4, 4))
-        motion = estimate_motion(points, covariance, both, pixels, np.eye(4), self._rig, min_inliers)
+        motion = estimate_motion(points, covariance, both, pixels, [np.eye(4)], self._rig, min_inliers)
         if motion is None or motion.inliers.mean() < 0.25:
             return None
         return Relocalisation(

@@ -81,7 +81,7 @@ def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | Non
     lateral = (_DRIFT_PX * here[:, 2] / rig.left.fx) ** 2
     px = np.hstack((left_px, np.full((n, 2), np.nan)))
     pixels = np.broadcast_to(np.eye(4), (n, 4, 4))
-    motion = estimate_motion(here, lateral[:, None, None] * np.eye(3), px, pixels, np.eye(4), rig, _LEAST)
+    motion = estimate_motion(here, lateral[:, None, None] * np.eye(3), px, pixels, [np.eye(4)], rig, _LEAST)
     return motion if motion is not None and motion.inliers.mean() > 0.5 else None
 
 
