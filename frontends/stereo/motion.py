@@ -63,8 +63,8 @@ def estimate_motion(
     consensus = _consensus(points, px[:, :2], rig)
     if consensus is not None:
         candidates.append(consensus)
-    pose = min(candidates, key=data.cost)
-    pose = data.refine(pose)
+    start = min(candidates, key=data.cost)
+    pose = min((data.refine(start), start), key=data.cost)
     chi2 = data.chi2(pose)
     inliers = chi2 < data.gate * data.excess(pose)
     if inliers.sum() < min_inliers:
@@ -139,12 +139,16 @@ class _Problem:
         return float(np.clip(np.median(self.chi2(pose) / self.expected), 1.0, 16.0))
 
     def refine(self, pose: Float, steps: int = 10) -> Float:
-        """Gauss-Newton with Cauchy weights; the pose is moved from the right."""
+        """Gauss-Newton with the weights of Geman and McClure; the pose is moved from the right.
+
+        They fall off faster than the pull of near points grows, so that an arm close to the lens is let go.
+        """
+        scale = self.gate * self.excess(pose)
         information = self._information(pose, self._here(pose))
         for _ in range(steps):
             here = self._here(pose)
             residual = self._residuals(here)
-            weight = 1.0 / (1.0 + _square(residual, information) / self.gate)
+            weight = 1.0 / (1.0 + _square(residual, information) / scale) ** 2
             by_point = self._jacobian(here)
             by_pose = np.concatenate((by_point @ _cross(here), -by_point), axis=2)
             weighted = (weight[:, None, None] * information) @ by_pose

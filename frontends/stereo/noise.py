@@ -62,7 +62,7 @@ class NoiseModel:
     def learn_flow(self, chi2: Float) -> None:
         """Follows the squared residuals (n,) in sigmas of plain flow."""
         ratio = _median_ratio(chi2, np.zeros(len(chi2), dtype=bool))
-        self._flow_gain = float(np.clip(self._flow_gain * ratio**_RATE, 0.05, 400.0))
+        self._flow_gain = float(np.clip(self._flow_gain * ratio**_RATE, 0.25, 400.0))
 
     def learn_mismatch(self, alignment: Alignment, patches: Patches, seen: Bool) -> None:
         """Follows how much tracked patches differ from their reference, in squared grey values."""
