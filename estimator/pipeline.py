@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors.errors import LogError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pipe.pairs import OutlinePrior
@@ -16,7 +17,7 @@ from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .engine import Bundle, Engine
 from .pipes import AXIS_ROLES
 from .sensors import PairImages, Sensors, by_info_topic
-from .surfaces import Associator
+from .surfaces import Associator, lay_on_surfaces
 
 Item = Message | StereoPair
 
@@ -41,7 +42,7 @@ def wanted_topics(rig: Rig) -> frozenset[str]:
 class Pipeline:
     """Feeds one engine from messages."""
 
-    def __init__(self, rig: Rig, associate: Associator) -> None:
+    def __init__(self, rig: Rig, associate: Associator = lay_on_surfaces) -> None:
         self.rig = rig
         self.sensors = Sensors(rig)
         self.engine = Engine(rig, self.sensors.cameras, associate)
@@ -65,7 +66,13 @@ class Pipeline:
     def _plain(self, message: Message) -> Message:
         """A compressed topic counts as its raw one."""
         if message.topic.endswith(COMPRESSED):
-            return Message(message.topic.removesuffix(COMPRESSED), message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
+            return Message(
+                message.topic.removesuffix(COMPRESSED),
+                message.log_time_ns,
+                message.stamp_ns,
+                message.frame_id,
+                message.body,
+            )
         return message
 
     def process(self, group: list[Item]) -> None:
@@ -132,6 +139,26 @@ class Pipeline:
             if cloud is not None:
                 self.engine.add(Bundle(stamp_ns, cloud=cloud))
 
+    def check(self) -> None:
+        """After the last message: is there anything to estimate from, and was everything understood?
+
+        Raises:
+            LogError: a pick without depth or second view, or on a camera that never delivered.
+        """
+        report = self.pairing
+        if report.pairs == 0 and report.unpaired and not self.engine.odometry.keyframe_stamps:
+            counts = ", ".join(f"{topic} {count}" for topic, count in sorted(report.unpaired.items()))
+            raise LogError(
+                f"no stereo pair: stamps of left and right never agree ({counts} images); synchronise the cameras"
+            )
+        for name, point in self.engine.pipes.points.items():
+            if not point.known:
+                pick = point.held[-1][1]
+                raise LogError(
+                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no second "
+                    "view; pick the point again from another place"
+                )
+
     # Outlines -------------------------------------------------------------------------------------------------
 
     def _keep(self, pair: PairImages) -> None:
@@ -146,7 +173,9 @@ class Pipeline:
             if pick.role in AXIS_ROLES and pick.camera in ("m_left", "m_right"):
                 pipe = self.engine.pipes.pipe_of(pick.point_id)
                 finder = self.sensors.outline_finder(pick.camera)
-                self._take(finder.near_pick(pair.stamp_ns, pipe, pair.of(pick.camera), pick.px))
+                click = float(np.sqrt(pick.covariance_px2.trace() / 2))
+                prior = OutlinePrior(pick.px, click)
+                self._take(finder.find(pair.stamp_ns, pipe, pair.of(pick.camera), prior))
                 self._looked.setdefault(f"{pipe} {pick.camera}", set()).add(pair.stamp_ns)
         self.engine.flush()
         for pipe in list(self.engine.pipes.cylinders):
@@ -200,7 +229,7 @@ def _outline_prior(
             continue
         half = float(K[0, 0] * axis[2] / np.sqrt(max(a[2] ** 2 - axis[2] ** 2, 1e-6)))
         angle = float(np.arctan2(pb[1] - pa[1], pb[0] - pa[0]))
-        return OutlinePrior(pa, 4.0, half, 0.15 * half + 0.5, angle, np.deg2rad(6.0))
+        return OutlinePrior(pa, 1.5, half, 0.15 * half + 0.5, angle, np.deg2rad(6.0))
     return None
 
 

@@ -24,6 +24,8 @@ MINIMUM_PARALLAX_RAD = 0.03
 WIDE_RADIUS_M = (0.05, 0.04)
 """Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
 GAUGE_HALF_LENGTH_M = 0.25
+EDGE_FLOOR_PX = 0.08
+"""Blur and shading move an edge by about this much from its place, the same for all pixels of one view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,14 +254,15 @@ class Pipes:
             )
             return
         K = self._state.intrinsics(keys.intrinsics(sighting.camera)).K()
-        covariance = tangency_covariance(sighting.lines, sighting.covariance, sighting.foot_px, K, a, b)
-        # Lines are positive outside the pipe; the factor wants the axis on the positive side.
-        model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
-        factor = outline_factor(sighting.camera, -sighting.lines, covariance, where.key, i, model)
-        what = f"outline of {cylinder.pipe.id} in {sighting.camera}"
-        update.add(
-            factor, Record(OUTLINE, f"outline {sighting.camera}", sighting.stamp_ns, what, camera=sighting.camera)
-        )
+        for side in range(2):
+            # Lines are positive outside the pipe; the factor wants the axis on the positive side.
+            line, own = -sighting.lines[side], sighting.covariance[side] + np.diag([EDGE_FLOOR_PX**2, 0.0])
+            covariance = tangency_covariance(line, own, sighting.foot_px[side], K, a, b)
+            model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
+            factor = outline_factor(sighting.camera, line, model, where.key, i)
+            what = f"edge {side} of {cylinder.pipe.id} in {sighting.camera}"
+            source = f"outline {sighting.camera}"
+            update.add(factor, Record(OUTLINE, source, sighting.stamp_ns, what, camera=sighting.camera))
         cylinder.outlines += 1
 
     def _attach(self, point: _Point, update: Update) -> None:

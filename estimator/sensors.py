@@ -74,7 +74,9 @@ class Sensors:
         left = self.cameras["m_left"].baseline_m or 0.0
         info = self.rig.cameras.m_right.info_topic
         if baseline < 0 or (baseline == 0 and left > 0):
-            raise LogError(f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; exchange their topics in the rig file")
+            raise LogError(
+                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; exchange their topics in the rig file"
+            )
         if baseline == 0:
             raise LogError(f"{info}: no baseline in P[3]; give stereo.m_left_T_m_right in the rig file")
 
@@ -93,14 +95,18 @@ class Sensors:
     def _camera(self, name: str) -> CameraModel:
         if name not in self.cameras:
             topic = getattr(self.rig.cameras, name).info_topic
-            raise LogError(f"{topic}: no calibration of {name} before its first image; record camera_info or correct the topic in the rig file")
+            raise LogError(
+                f"{topic}: no calibration of {name} before its first image; record camera_info or correct the topic in the rig file"
+            )
         return self.cameras[name]
 
     @staticmethod
     def _fits(camera: CameraModel, image: Grey, topic: str) -> None:
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
-            raise LogError(f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; record the camera_info that belongs to the images")
+            raise LogError(
+                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; record the camera_info that belongs to the images"
+            )
 
     def depth_under(self, pick: Pick, pair: PairImages) -> tuple[float, float] | None:
         """Depth of the surface under a click in the left image by semi-global matching, and its sigma, m."""
@@ -167,11 +173,15 @@ class Sensors:
         topic = self.rig.picks_topic
         where = f"{topic} at {stamp_ns} ns: pick {body.point_id}"
         if body.camera not in ("m_left", "m_right", "b_rgb"):
-            raise LogError(f"{where} names camera {body.camera!r}; picks are in m_left, m_right or b_rgb (header.frame_id)")
+            raise LogError(
+                f"{where} names camera {body.camera!r}; picks are in m_left, m_right or b_rgb (header.frame_id)"
+            )
         camera = self._camera(body.camera)
         u, v = (float(x) for x in body.px)
         if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
-            raise LogError(f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of {body.camera}; pick again")
+            raise LogError(
+                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of {body.camera}; pick again"
+            )
         if body.role not in ("grasp", "cut", "other"):
             raise LogError(f"{where} has role {body.role!r}; roles are grasp, cut and other")
         if not (body.sigma_px > 0 and np.isfinite(body.sigma_px)):
@@ -179,7 +189,9 @@ class Sensors:
         covariance = np.eye(2)[None] * body.sigma_px**2
         ideal, spread = undistort(camera, body.px[None], covariance)
         if spread is None or not np.isfinite(ideal).all():
-            raise LogError(f"{where} lies where the lens model of {body.camera} does not reach; pick nearer to the centre")
+            raise LogError(
+                f"{where} lies where the lens model of {body.camera} does not reach; pick nearer to the centre"
+            )
         name = cast(CameraName, body.camera)
         return Pick(stamp_ns, name, body.point_id, body.role, ideal[0], np.asarray(body.px, float), spread[0])  # type: ignore[arg-type]
 
