@@ -133,7 +133,8 @@ def test_logs_without_a_result_and_wrong_usage(tmp_path, capsys):
     empty = stored(tmp_path, False, "empty.mcap")
     status, told = run(empty, "-o", tmp_path / "r.html", capsys=capsys)
     assert status == 1
-    assert "holds no result" in told.err
+    assert told.err.startswith("surecut: ")
+    assert told.err.count("\n") == 1
     status, told = run(tmp_path / "none.mcap", "-o", tmp_path / "r.html", capsys=capsys)
     assert status == 1
     assert "cannot be read" in told.err

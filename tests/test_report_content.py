@@ -4,6 +4,7 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from surecut.estimator.report.blocks import Table
 from surecut.estimator.report.compare import Run, build_comparison, mahalanobis2
 from surecut.estimator.report.content import build_document
 from surecut.estimator.report.essentials import budget_closure, budget_rows
+from surecut.estimator.report.glossary import TERMS
 from surecut.estimator.report.html import render_html
 from surecut.estimator.report.machine import render_json
 from surecut.estimator.report.text import duration, fixed, mm, mm_with, significant, utc, with_sigma
@@ -105,7 +107,14 @@ def test_structure():
         ("h2", "What was refused"),
         ("h2", "Live against offline"),
         ("h2", "Where it comes from"),
+        ("h1", "Words"),
     ]
+
+
+def test_the_glossary_in_the_documents_is_the_one_in_the_report():
+    text = (Path(__file__).parent.parent / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    assert rows == [f"| {term} | {meaning} |" for term, meaning in TERMS]
 
 
 def test_nothing_from_outside_and_no_script():

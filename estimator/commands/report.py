@@ -16,7 +16,7 @@ from ..report.content import build_document
 from ..report.html import render_html
 from ..report.machine import render_json
 from ..result import Result
-from ..result_json import ResultError, from_json, stored_sha256
+from ..result_json import ResultError, from_json, stored_sha256, to_json
 from ..validated_range import load_validated_range
 
 ATTACHMENT = "result.json"
@@ -34,7 +34,7 @@ class StoredResult:
 
 
 def command(
-    result: Annotated[Path, typer.Argument(help="The MCAP file that `surecut optimise` wrote, or its result.json.")],
+    result: Annotated[Path, typer.Argument(help="What `surecut optimise` wrote (MCAP or JSON), or a recording.")],
     html_file: Annotated[Path | None, typer.Option("-o", "--output", help="Write the report as HTML.")] = None,
     pdf_file: Annotated[Path | None, typer.Option("--pdf", help="Write the report as PDF.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the report as JSON.")] = None,
@@ -66,33 +66,38 @@ def command(
 
 
 def read_result(path: Path, rig: Path | None = None) -> StoredResult:
-    """The result in an MCAP file (attachment `result.json`) or in a JSON file.
+    """The result in an MCAP file (attachment `result.json`) or in a JSON file; a recording without one is estimated.
 
     Raises:
-        SurecutError: no such file, no result in it, of a newer version, or edited by hand.
+        SurecutError: no such file, a result of a newer version or edited by hand, or a recording without an answer.
     """
     try:
-        with path.open("rb") as file:
-            is_log = file.read(len(MCAP_MAGIC)) == MCAP_MAGIC
-        text = _attached(path) if is_log else path.read_bytes()
+        text = _text(path)
     except OSError as error:
         reason = f"cannot be read ({error.strerror})"
         raise ResultError(f"{path}: {reason}; give the file that `surecut optimise` wrote") from error
+    if text is None:
+        from ..optimise import optimise  # the whole estimator, needed only here
+
+        text = to_json(optimise(path, rig, command=f"surecut report {path.name}")).encode()
     result = from_json(text, str(path))
     used = load_rig(rig) if rig is not None else load_rig(result.config_yaml, f"{path}: effective rig")
     return StoredResult(path.name, result, used, stored_sha256(text))
 
 
+def _text(path: Path) -> bytes | None:
+    """The stored result; None where the path is a recording that holds none."""
+    if path.is_dir():
+        return None
+    with path.open("rb") as file:
+        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+            return path.read_bytes()
+    with LogReader(path) as reader:
+        return reader.attachment(ATTACHMENT)
+
+
 def _run(stored: StoredResult) -> Run:
     return Run(stored.name, stored.result, stored.rig, stored.sha256)
-
-
-def _attached(path: Path) -> bytes:
-    with LogReader(path) as reader:
-        content = reader.attachment(ATTACHMENT)
-    if content is None:
-        raise ResultError(f"{path}: holds no result; `surecut optimise {path.name} -o RESULT.mcap` makes one")
-    return content
 
 
 def _write(document: Document, html_file: Path | None, pdf_file: Path | None) -> None:

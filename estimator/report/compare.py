@@ -57,6 +57,7 @@ def _verdicts(a: Run, b: Run, validated: ValidatedRange | None) -> Iterator[Bloc
         header=("Point", "A", "", "B", ""),
         rows=tuple((name, *_verdict(left.get(name)), *_verdict(right.get(name))) for name in names),
         numeric=(2, 4),
+        widths=(0.2, 0.25, 0.13, 0.29, 0.13),
     )
 
 

@@ -7,6 +7,7 @@ from ..validated_range import ValidatedRange
 from .blocks import Block, Document, Heading, Paragraph, Table
 from .essentials import banner, detail_pages, point_pages
 from .evidence import evidence_pages
+from .glossary import TERMS
 from .text import mm, utc
 
 TITLE = "Uncertainty report for cut safety"
@@ -30,6 +31,7 @@ def build_document(
         *_opening(result, decisions),
         *_points(result, decisions),
         *evidence_pages(result, validated),
+        *_glossary(),
     )
     return Document(
         title=TITLE,
@@ -37,6 +39,11 @@ def build_document(
         footer=f"surecut {version} · result {sha256[:16]} · log {log[:16]}",
         blocks=blocks,
     )
+
+
+def _glossary() -> tuple[Block, ...]:
+    table = Table("In plain words.", ("word", "meaning"), TERMS, widths=(0.28, 0.72))
+    return Heading("Words", 1, new_page=True), table
 
 
 def _opening(result: Result, decisions: tuple[Decision, ...]) -> list[Block]:

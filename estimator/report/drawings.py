@@ -1,6 +1,6 @@
 """The report's figures: verdict sign, three views, bars of the budget, acceptance intervals."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
@@ -99,12 +99,14 @@ def _panel(
         Label(x, y - 5, view.title, 8.5, bold=True),
         rectangle(x, y, size, size, pen=0.5, grey=MIDDLE),
     ]
-    if cut is not None:
-        strokes += _tolerance(view, directions, cut, centre, scale, (x, y, size))
+    tolerance = [] if cut is None else _tolerance(view, directions, cut, centre, scale, (x, y, size))
+    strokes += tolerance
     for covariance, style in ((total, WITH_TOOL), (measured, MEASURED)):
         curve = ellipse(centre, flip @ (covariance[pick] * scale**2) @ flip.T, K3, **style)
         kept = clipped(curve, x, y, size, size)
         strokes += [kept] if kept is not None else []
+    # Again without its fill, so that a region larger than the tolerance does not hide it.
+    strokes += [replace(stroke, fill=None) for stroke in tolerance]
     cx, cy = centre
     strokes += [line(cx - 4, cy, cx + 4, cy, pen=0.9), line(cx, cy - 4, cx, cy + 4, pen=0.9)]
     right, up = directions.names[view.right], directions.names[view.up]
@@ -129,7 +131,7 @@ def _tolerance(
     centre: tuple[float, float],
     scale: float,
     frame: tuple[float, float, float],
-) -> list[Stroke]:
+) -> list[Path]:
     """The tolerance region's outline: a disc along the pipe, a rectangle from the side, a ball without an axis."""
     along, across = max(along_room_m(cut), 0.0) * scale, cut.tolerance_across_m * scale
     if directions.names[0] != "along":

@@ -78,12 +78,17 @@ def banner(point_id: str, decision: Decision | None, result: Result) -> Banner:
 
 def _figures(decision: Decision) -> Iterator[tuple[str, str]]:
     chance = "cannot be stated" if decision.probability is None else percent(decision.probability)
-    yield "all limits kept, tool included", chance
+    yield (
+        ("all limits kept, were it not for the doubts" if decision.blockers else "all limits kept, tool included"),
+        chance,
+    )
     yield "required", percent(decision.required)
     yield "with a perfect measurement", percent(decision.tool_only)
-    if decision.margin is not None and decision.margin >= 1:
+    if decision.blockers or decision.margin is None:
+        return
+    if decision.margin >= 1:
         yield "reserve of uncertainty", f"factor {np.floor(decision.margin * 100) / 100:.2f}"
-    elif decision.margin is not None:
+    else:
         yield "uncertainty must fall to", _percent_of(decision.margin)
 
 
@@ -92,11 +97,11 @@ def _details(decision: Decision, result: Result) -> Iterator[str]:
     for blocker in decision.blockers[1:] if decision.verdict == "MEASURE MORE" else decision.blockers:
         yield f"Also: {blocker}."
     for requirement in decision.requirements:
-        yield f"{percent(requirement.probability)}: {requirement.text}."
+        yield f"{requirement.text[:1].upper()}{requirement.text[1:]}: kept with {percent(requirement.probability)}."
     if decision.expires_ns is not None and result.last_board_view_ns is not None:
         age = duration((result.end_ns - result.last_board_view_ns) * 1e-9)
-        end = utc(decision.expires_ns)
-        yield f"Board last seen {age} before the end of the recording; any permission ends at {end}."
+        ends = "ends" if decision.expires_ns >= result.end_ns else "ended"
+        yield f"Board last seen {age} before the end of the recording; permission {ends} at {utc(decision.expires_ns)}."
     yield from decision.notes
 
 

@@ -34,7 +34,7 @@ def _consistency(result: Result) -> Iterator[Block]:
     if consistency.passed:
         yield Paragraph("Yes. Every family of measurements scatters as much as its stated uncertainty says.")
     else:
-        yield Paragraph("NO. " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
+        yield Paragraph("NO: " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
     if not consistency.by_family:
         return
     rows = tuple(
