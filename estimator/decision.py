@@ -17,7 +17,7 @@ from scipy.special import ndtr, ndtri
 from ..factors.rig import Cut, Rig
 from .clearance import SweptDisc, box_gap, pipe_gap
 from .region_probability import ball_probability, cylinder_probability
-from .result import PointEstimate, Result
+from .result import PipeEstimate, PointEstimate, Result
 from .validated_range import ValidatedRange
 
 Float = NDArray[np.float64]
@@ -235,7 +235,7 @@ def _covariance_fault(point: PointEstimate) -> str | None:
 
 
 def _obstacles(cut: Cut, point: PointEstimate, result: Result) -> tuple[Obstacle, ...]:
-    own = next((pipe for pipe in result.pipes if pipe.id == point.pipe_id), None)
+    own = _own_pipe(point, result)
     axis = None if point.axis is None else point.axis / np.linalg.norm(point.axis)
     disc = SweptDisc(point.position_m, axis, own.radius_m if own else 0.0, cut.blade_width_m / 2)
     found: list[Obstacle] = []
@@ -243,7 +243,7 @@ def _obstacles(cut: Cut, point: PointEstimate, result: Result) -> tuple[Obstacle
         gap, direction = box_gap(disc, np.array(box.minimum_m), np.array(box.maximum_m))
         found.append(Obstacle(f"keep-out box {index + 1}", gap, direction, 0.0))
     for pipe in result.pipes:
-        if pipe.id != point.pipe_id and pipe.frame == point.frame:
+        if pipe is not own and pipe.frame == point.frame:
             gap, direction = pipe_gap(disc, pipe.point_m, pipe.axis, pipe.radius_m)
             # Place and radius may err together: their deviations add.
             sigma = np.sqrt(direction @ pipe.covariance[:3, :3] @ direction) + np.sqrt(pipe.covariance[6, 6])
@@ -253,6 +253,17 @@ def _obstacles(cut: Cut, point: PointEstimate, result: Result) -> tuple[Obstacle
         gap = surface.distance_m - float(disc.reach(surface.direction[None])[0])
         found.append(Obstacle(surface.what, gap, surface.direction, surface.sigma_m, includes_point=True))
     return tuple(found)
+
+
+def _own_pipe(point: PointEstimate, result: Result) -> PipeEstimate | None:
+    """The pipe that the point names; where it names none, the pipe that it lies in."""
+    for pipe in result.pipes:
+        if pipe.id == point.pipe_id:
+            return pipe
+        apart = np.linalg.norm(np.cross(point.position_m - pipe.point_m, pipe.axis))
+        if point.pipe_id is None and pipe.frame == point.frame and apart < pipe.radius_m:
+            return pipe
+    return None
 
 
 def _requirements(cut: Cut, point: PointEstimate, obstacles: tuple[Obstacle, ...]) -> tuple[Requirement, ...]:

@@ -28,6 +28,10 @@ _THRESHOLDS = {
     "d": [1e-3, 1e-3],
 }
 
+RELINEARIZE_EVERY = 10
+"""Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
+of a batch solution; `settle` makes up for what is left at the end."""
+
 
 class Incremental:
     """iSAM2 with the bookkeeping that lets single measurements be switched off again."""
@@ -38,7 +42,7 @@ class Incremental:
         for letter, values in _THRESHOLDS.items():
             thresholds.insert((letter, np.array(values)))
         parameters.setRelinearizeThreshold(thresholds)
-        parameters.relinearizeSkip = 1
+        parameters.relinearizeSkip = RELINEARIZE_EVERY
         self._isam = gtsam.ISAM2(parameters)
         self.log = FactorLog()
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.measurements import OutlineSighting, Pick, Rejection
-from ..factors.noise import gaussian, robust
+from ..factors.noise import gaussian, robust, sigmas
 from ..factors.pipe import axis_gauge, line_planes, on_axis_factor, outline_factor, radius_prior, tangency_covariance
-from ..factors.projection import machine_projection, mobile_projection
+from ..factors.projection import depth_factor, machine_projection, mobile_projection
 from ..factors.rig import Pipe, Rig
 from .graph import Record, State, Update
 
@@ -24,6 +24,8 @@ MINIMUM_PARALLAX_RAD = 0.03
 WIDE_RADIUS_M = (0.05, 0.04)
 """Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
 GAUGE_HALF_LENGTH_M = 0.25
+EDGE_FLOOR_PX = 0.08
+"""Blur and shading move an edge by about this much from its place, the same for all pixels of one view."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,8 @@ class Pipes:
         for where, held in point.held:
             self._observe(point, where, held, update)
         point.held.clear()
+        if depth_m is not None and pick.camera == "m_left":
+            self._observe_depth(point, seen_from, pick, depth_m, update)
         self._attach(point, update)
         return update
 
@@ -126,6 +130,19 @@ class Pipes:
         update.add(factor, Record(FAMILY, f"picks {pick.point_id}", pick.stamp_ns, what, camera=pick.camera))
         point.picks += 1
         point.stamp_ns = max(point.stamp_ns, pick.stamp_ns)
+
+    def _observe_depth(
+        self, point: _Point, where: SeenFrom, pick: Pick, depth_m: tuple[float, float], update: Update
+    ) -> None:
+        """The surface's depth under a click. A point on the axis lies a radius behind it, and radii are only roughly
+        known until the pipe's outline is seen: for it this says little, but enough to place one click."""
+        mean, sigma = depth_m
+        if point.role in AXIS_ROLES:
+            mean, sigma = mean + WIDE_RADIUS_M[0], float(np.hypot(sigma, WIDE_RADIUS_M[1]))
+        model = robust(sigmas([sigma]), self._rig.gates.robust_sigma)
+        what = f"stereo depth under pick {pick.point_id}"
+        factor = depth_factor(where.key, keys.point(point.index), mean, model)
+        update.add(factor, Record(FAMILY, f"depth under {pick.point_id}", pick.stamp_ns, what, camera=pick.camera))
 
     # Pipes ----------------------------------------------------------------------------------------------------
 
@@ -237,14 +254,15 @@ class Pipes:
             )
             return
         K = self._state.intrinsics(keys.intrinsics(sighting.camera)).K()
-        covariance = tangency_covariance(sighting.lines, sighting.covariance, sighting.foot_px, K, a, b)
-        # Lines are positive outside the pipe; the factor wants the axis on the positive side.
-        model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
-        factor = outline_factor(sighting.camera, -sighting.lines, covariance, where.key, i, model)
-        what = f"outline of {cylinder.pipe.id} in {sighting.camera}"
-        update.add(
-            factor, Record(OUTLINE, f"outline {sighting.camera}", sighting.stamp_ns, what, camera=sighting.camera)
-        )
+        for side in range(2):
+            # Lines are positive outside the pipe; the factor wants the axis on the positive side.
+            line, own = -sighting.lines[side], sighting.covariance[side] + np.diag([EDGE_FLOOR_PX**2, 0.0])
+            covariance = tangency_covariance(line, own, sighting.foot_px[side], K, a, b)
+            model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
+            factor = outline_factor(sighting.camera, line, model, where.key, i)
+            what = f"edge {side} of {cylinder.pipe.id} in {sighting.camera}"
+            source = f"outline {sighting.camera}"
+            update.add(factor, Record(OUTLINE, source, sighting.stamp_ns, what, camera=sighting.camera))
         cylinder.outlines += 1
 
     def _attach(self, point: _Point, update: Update) -> None:
@@ -267,6 +285,11 @@ class Pipes:
         i = cylinder.index
         radius = float(self._state.vector(keys.radius(i))[0])
         return self._state.point(keys.axis_start(i)), self._state.point(keys.axis_end(i)), radius
+
+    def places(self, pipe_id: str) -> list[Float]:
+        """Points on a pipe as believed now, in {o}."""
+        on_it = [p for p in self.points.values() if p.known and p.pipe == pipe_id]
+        return [self._state.point(keys.point(p.index)) for p in on_it if self._state.has(keys.point(p.index))]
 
     def held_back(self) -> list[Rejection]:
         """Picks and outlines that never entered."""

@@ -36,7 +36,7 @@ def cylinder_probability(covariance_m2: Float, axis: Float, along_m: float, acro
     turn = axis_frame(axis)
     local = turn @ covariance_m2 @ turn.T
     across = local[1:, 1:]
-    slope = np.linalg.solve(across, local[1:, 0])
+    slope: Float = np.linalg.solve(across, local[1:, 0]).astype(np.float64)
     spread = float(np.sqrt(max(local[0, 0] - local[0, 1:] @ slope, 1e-18 * local[0, 0])))
     whiten, kappa = _whitened(across, slope)
     column_1, column_2 = whiten.T
@@ -78,12 +78,12 @@ def axis_frame(axis: Float) -> Float:
     helper = np.eye(3)[np.argmin(np.abs(along))]
     side = np.cross(along, helper)
     side /= np.linalg.norm(side)
-    return np.stack([along, side, np.cross(along, side)])
+    return np.array([along, side, np.cross(along, side)], dtype=np.float64)
 
 
 def _whitened(across: Float, slope: Float) -> tuple[Float, float]:
     """Square root M of the covariance across (c = M z), turned so that slope . c = kappa z2."""
-    root = np.linalg.cholesky(across)
+    root: Float = np.linalg.cholesky(across).astype(np.float64)
     gradient = root.T @ slope
     kappa = float(np.linalg.norm(gradient))
     if kappa == 0.0:

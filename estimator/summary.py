@@ -43,6 +43,7 @@ class Summary:
         graph = gtsam.NonlinearFactorGraph()
         for _, factor, _ in self._active:
             graph.add(factor)
+        self._graph = graph
         self._system = LinearSystem(graph, solution.values)
 
     def result(
@@ -157,17 +158,10 @@ class Summary:
         return tuple(poses)
 
     def _keyframe_covariances(self) -> list[Float]:
-        """All keyframes' own covariances, in blocks of right-hand sides."""
+        """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
+        marginals = gtsam.Marginals(self._graph, self._values)
         count = self._engine.odometry.last_keyframe + 1
-        covariances: list[Float] = []
-        for start in range(0, count, 20):
-            block = [keys.keyframe(i) for i in range(start, min(start + 20, count))]
-            right = np.zeros((self._system.parameters, 6 * len(block)))
-            for i, key in enumerate(block):
-                right[self._system.columns[key], 6 * i : 6 * i + 6] = np.eye(6)
-            solved = self._system.solve(right)
-            covariances += [solved[self._system.columns[k], 6 * i : 6 * i + 6] for i, k in enumerate(block)]
-        return covariances
+        return [marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
 
     # Calibration and distances --------------------------------------------------------------------------------
 
@@ -184,17 +178,17 @@ class Summary:
                 frozen = ["focal" in settings.freeze] * 2 + [True] + ["centre" in settings.freeze] * 2
                 for i, part in ((0, "fx"), (1, "fy"), (3, "cx"), (4, "cy")):
                     rows.append(
-                        CalibrationEstimate(f"{camera} {part}", "px", value[i], sigma[i], mean[i], prior[i], frozen[i])
+                        CalibrationEstimate(f"{camera}.{part}", "px", value[i], sigma[i], mean[i], prior[i], frozen[i])
                     )
         rows += self._extrinsic_rows()
         if self._values.exists(keys.DEPTH):
             value, sigma, prior = self._values.atVector(keys.DEPTH), self._sigmas(keys.DEPTH), depth_sigmas(rig.kinect)
             freeze = rig.kinect.freeze
             rows.append(
-                CalibrationEstimate("b_depth offset", "m", value[0], sigma[0], 0.0, prior[0], "depth_offset" in freeze)
+                CalibrationEstimate("depth_offset", "m", value[0], sigma[0], 0.0, prior[0], "depth_offset" in freeze)
             )
             rows.append(
-                CalibrationEstimate("b_depth scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
+                CalibrationEstimate("depth_scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
             )
         for board in rig.boards:
             page = keys.page(engine.boards.index(board.id))
@@ -202,12 +196,12 @@ class Summary:
                 value, sigma = self._values.atVector(page), self._sigmas(page)
                 rows.append(
                     CalibrationEstimate(
-                        f"{board.id} side", "m", value[0], sigma[0], board.side_m, board.side_sigma_m, False
+                        f"{board.id}.side", "m", value[0], sigma[0], board.side_m, board.side_sigma_m, False
                     )
                 )
                 rows.append(
                     CalibrationEstimate(
-                        f"{board.id} print scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
+                        f"{board.id}.print_scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
                     )
                 )
         return tuple(rows)
@@ -233,12 +227,12 @@ class Summary:
             moved = gtsam.Pose3.Logmap(mean.between(self._values.atPose3(key)))
             sigma = self._sigmas(key)
             for i, part in enumerate(("rx", "ry", "rz")):
-                rows.append(CalibrationEstimate(f"{name} {part}", "rad", moved[i], sigma[i], 0.0, spread[i], frozen))
+                rows.append(CalibrationEstimate(f"{name}.{part}", "rad", moved[i], sigma[i], 0.0, spread[i], frozen))
             nominal = mean.rotation().matrix().T @ mean.translation()
             for i, part in enumerate(("tx", "ty", "tz")):
                 rows.append(
                     CalibrationEstimate(
-                        f"{name} {part}",
+                        f"{name}.{part}",
                         "m",
                         nominal[i] + moved[3 + i],
                         sigma[3 + i],

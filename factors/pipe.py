@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from . import keys
 from .geometry import point_to_frame
-from .noise import gaussian, sigmas
+from .noise import Model, gaussian, sigmas
 
 Float = NDArray[np.float64]
 
@@ -32,68 +32,58 @@ def line_planes(lines: Float, K: Float) -> tuple[Float, Float]:
     return normals / lengths[:, None], lengths
 
 
-def tangency(lines: Float, K: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
-    """Both outline planes touch the cylinder: `n . p = radius` for the axis points p = a, b in the camera frame.
+def tangency(line: Float, K: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
+    """An outline's plane touches the cylinder: `n . p = radius` for the axis points p = a, b in the camera frame.
 
     Args:
-        lines: shape (2, 3), oriented so that the axis lies on the positive side.
+        line: shape (3,), oriented so that the axis lies on the positive side.
 
     Returns:
-        residual (4,) in metres, ordered (line 0: a, b; line 1: a, b), d residual / d (a, b, radius) (4, 7),
-        d residual / d (fx, fy, skew, cx, cy) (4, 5).
+        residual (2,) in metres, d residual / d (a, b, radius) (2, 7),
+        d residual / d (fx, fy, skew, cx, cy) (2, 5).
     """
-    normals, lengths = line_planes(lines, K)
+    normals, lengths = line_planes(line[None], K)
+    n = normals[0]
     points = np.stack([a, b])
-    residual = normals @ points.T - radius
-    shape_jacobian = np.zeros((2, 2, 7))
-    intrinsic_jacobian = np.empty((2, 2, 5))
-    for i in range(2):
-        shape_jacobian[i, 0, :3] = normals[i]
-        shape_jacobian[i, 1, 3:6] = normals[i]
-        # n = m / |m| with m = K^T l: d(n . p) = (p - (n . p) n) . dm / |m|
-        across = (points - (points @ normals[i])[:, None] * normals[i]) / lengths[i]
-        l0, l1, _ = lines[i]
-        dm = np.array([[l0, 0, 0], [0, l1, 0], [0, l0, 0], [0, 0, l0], [0, 0, l1]])
-        intrinsic_jacobian[i] = across @ dm.T
-    shape_jacobian[:, :, 6] = -1.0
-    return residual.ravel(), shape_jacobian.reshape(4, 7), intrinsic_jacobian.reshape(4, 5)
+    distance = points @ n
+    shape_jacobian = np.zeros((2, 7))
+    shape_jacobian[0, :3] = n
+    shape_jacobian[1, 3:6] = n
+    shape_jacobian[:, 6] = -1.0
+    # n = m / |m| with m = K^T l: d(n . p) = (p - (n . p) n) . dm / |m|
+    across = (points - distance[:, None] * n) / lengths[0]
+    l0, l1, _ = line
+    dm = np.array([[l0, 0, 0], [0, l1, 0], [0, l0, 0], [0, 0, l0], [0, 0, l1]])
+    return distance - radius, shape_jacobian, across @ dm.T
 
 
-def tangency_covariance(lines: Float, covariance: Float, foot_px: Float, K: Float, a: Float, b: Float) -> Float:
-    """Covariance of `tangency`'s residual, shape (4, 4), from the lines' own.
+def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float, a: Float, b: Float) -> Float:
+    """Covariance of `tangency`'s residual, shape (2, 2), from the line's own.
 
     Args:
-        covariance: shape (2, 2, 2), of each line's offset [px] at its foot and of its direction [rad].
-        foot_px: shape (2, 2), the point of each line where the offset is meant.
+        covariance: shape (2, 2), of the line's offset [px] at its foot and of its direction [rad].
+        foot_px: shape (2,), the point of the line where the offset is meant.
         a, b: the axis points in the camera frame, as estimated.
     """
-    result = np.zeros((4, 4))
-    _, lengths = line_planes(lines, K)
-    for i in range(2):
-        direction = np.array([-lines[i, 1], lines[i, 0]])
-        G = np.empty((2, 2))
-        for row, p in enumerate((a, b)):
-            pixel = (K @ p)[:2] / p[2]
-            arm = float(direction @ (pixel - foot_px[i]))
-            # l . (u, v, 1) is the distance in pixels; n . p = z * that / |K^T l|
-            G[row] = p[2] / lengths[i] * np.array([1.0, arm])
-        block = slice(2 * i, 2 * i + 2)
-        result[block, block] = G @ covariance[i] @ G.T
-    return result + np.eye(4) * 1e-10
+    _, lengths = line_planes(line[None], K)
+    direction = np.array([-line[1], line[0]])
+    G = np.empty((2, 2))
+    for row, p in enumerate((a, b)):
+        pixel = (K @ p)[:2] / p[2]
+        # l . (u, v, 1) is the distance in pixels; n . p = z * that / |K^T l|
+        G[row] = p[2] / lengths[0] * np.array([1.0, float(direction @ (pixel - foot_px))])
+    return G @ covariance @ G.T + np.eye(2) * 1e-10
 
 
-def outline_factor(
-    camera: str, lines: Float, covariance: Float, pose: int, pipe: int, robust: gtsam.noiseModel.Base | None = None
-) -> gtsam.CustomFactor:
-    """The two edges of a pipe in one image.
+def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
+    """One edge of a pipe in one image.
 
     Args:
         camera: `m_left`, `m_right` or `b_rgb`.
-        lines: shape (2, 3), see `tangency`.
-        covariance: shape (4, 4), from `tangency_covariance`.
+        line: shape (3,), see `tangency`.
+        noise: of the residual (2,), see `tangency_covariance`.
         pose: key of `o_T_m` or `o_T_b`.
         pipe: index of the pipe.
-        robust: noise model to use instead of the plain covariance.
     """
     variables = [pose, keys.intrinsics(camera), keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
     if camera != "m_left":
@@ -105,7 +95,7 @@ def outline_factor(
         K = values.atCal3_S2(variables[1]).K()
         seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
         radius = float(values.atVector(variables[4])[0])
-        residual, d_shape, d_K = tangency(lines, K, seen[0][0], seen[1][0], radius)
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], radius)
         if jacobians is not None:
             d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
             jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
@@ -117,7 +107,7 @@ def outline_factor(
                 jacobians[5] = d_a @ seen[0][3] + d_b @ seen[1][3]
         return residual
 
-    return gtsam.CustomFactor(robust or gaussian(covariance), variables, error)
+    return gtsam.CustomFactor(noise, variables, error)
 
 
 def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
+from .geometry import point_to_frame
 from .noise import Model
 
 Float = NDArray[np.float64]
@@ -34,3 +35,16 @@ def _with_extrinsics(camera: str, px: Float, model: Model, pose: int, point: int
     return gtsam_unstable.ProjectionFactorPPPCCal3_S2(
         px, model, pose, keys.extrinsics(camera), point, keys.intrinsics(camera)
     )
+
+
+def depth_factor(keyframe: int, point: int, depth_m: float, noise: Model) -> gtsam.CustomFactor:
+    """Depth of a point along the left camera's optical axis, residual (1,) in metres."""
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        c_p, d_pose, d_point = point_to_frame(values.atPose3(keyframe), values.atPoint3(point))
+        if jacobians is not None:
+            jacobians[0] = d_pose[2:3]
+            jacobians[1] = d_point[2:3]
+        return np.array([c_p[2] - depth_m])
+
+    return gtsam.CustomFactor(noise, [keyframe, point], error)

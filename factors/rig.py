@@ -201,7 +201,7 @@ class Rig(Section):
     cameras: Cameras = Cameras()
     stereo: Stereo = Stereo()
     kinect: Kinect = Kinect()
-    boards: tuple[Board, ...] = Field(min_length=1)
+    boards: tuple[Board, ...] = ()
     distances: tuple[Distance, ...] = ()
     mount: Mount | None = None
     world_board: WorldBoard | None = None

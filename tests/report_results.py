@@ -74,7 +74,7 @@ def make_rig(cuts=None):
         markers=tuple(Marker(id=29 + i, centre_m=(0.12 * (i % 3 - 1), 0.12 * (i // 3 - 0.5))) for i in range(6)),
     )
     if cuts is None:
-        box = Box(minimum_m=(0.42, -0.6, 1.7), maximum_m=(0.6, 0.6, 2.2))
+        box = Box(minimum_m=(0.45, -0.6, 1.7), maximum_m=(0.6, 0.6, 2.2))
         cuts = (
             Cut(
                 point="P1",

@@ -15,6 +15,10 @@ Float = NDArray[np.float64]
 
 _STRETCH_PX = 8.0
 _ITERATIONS = 15
+_LOG_BLUR_RANGE = (float(np.log(0.4)), float(np.log(1.2)))
+"""A pixel alone blurs by 0.3 px. Edges softer than 1.2 px are shading or out of focus."""
+_FARTHEST_PX = 1.5
+"""The fit may move the line so far; the seed is better than that."""
 _KINKS_PX = (0.0, 1.8, 3.2)
 """Depths at which the shading may change its slope."""
 _SHADING_RANGE = 100.0
@@ -35,7 +39,10 @@ class EdgeFit:
     """Supported part of the line along (-l1, l0) from the foot, px."""
     blur_px: float
     contrast: float
-    """Median size of the step, grey values."""
+    """Median change of the grey value from 1 px outside to 1 px inside."""
+    sharpness: float
+    """Part of the change, from outside to well inside, that happens within 1 px of the edge: 1 for a step, 0.5 for a
+    lit limb before black, 0.25 where shading sets in at a kink."""
     supported: int
     """Number of stretches that agree with the line."""
     stretches: int
@@ -76,7 +83,6 @@ class _Linear:
     """(stretches,), where each alone would put the edge, px from the line."""
     shift_sigma: Float
     variance: Float
-    step: Float
 
 
 def _limb_table() -> tuple[Float, Float]:
@@ -112,7 +118,7 @@ def fit_edge(
     if pixels is None:
         return None
     start = np.zeros(1 + len(_KINKS_PX))
-    state, weights = _State(0.0, 0.0, float(np.log(0.7)), start), np.ones(len(pixels.grey))
+    state, weights = _State(0.0, 0.0, float(np.log(0.6)), start), np.ones(len(pixels.grey))
     for iteration in range(_ITERATIONS):
         linear = _linearise(pixels, state)
         weights = _weights(linear) if iteration >= 2 else np.ones(len(pixels.grey))
@@ -122,9 +128,9 @@ def fit_edge(
         step = np.linalg.solve(normal, scores.sum(axis=0))
         state.offset += float(np.clip(step[0], -0.7, 0.7))
         state.turn += float(np.clip(step[1], -0.03, 0.03))
-        state.log_blur = float(np.clip(state.log_blur + np.clip(step[2], -0.3, 0.3), np.log(0.35), np.log(2.5)))
+        state.log_blur = float(np.clip(state.log_blur + np.clip(step[2], -0.3, 0.3), *_LOG_BLUR_RANGE))
         state.shading = state.shading + step[3:]
-        if abs(state.offset) > 3.0 or abs(state.turn) > 0.12:
+        if abs(state.offset) > _FARTHEST_PX or abs(state.turn) > 0.12:
             return None
         if iteration > 6 and abs(step[0]) < 2e-3 and abs(step[1]) < 1e-4:
             break
@@ -179,7 +185,7 @@ def _linearise(pixels: _Pixels, state: _State) -> _Linear:
     variance = np.maximum((residual**2).sum(axis=1) / freedom, pixels.noise**2)
     strength = np.maximum((jacobian[..., 0] ** 2).sum(axis=1), 1e-9)
     shift = (jacobian[..., 0] * residual).sum(axis=1) / strength
-    return _Linear(jacobian, residual, shift, np.sqrt(variance / strength), variance, jump[:, 0])
+    return _Linear(jacobian, residual, shift, np.sqrt(variance / strength), variance)
 
 
 def _shading(tau: Float, blur: float, half_width: float) -> tuple[Float, Float, Float]:
@@ -259,13 +265,31 @@ def _result(
     inside = pixels.weight > 0
     start = np.where(inside, pixels.along, np.inf).min(axis=1)[good].min()
     end = np.where(inside, pixels.along, -np.inf).max(axis=1)[good].max()
+    contrast, sharpness = _sharpness(pixels, state, good)
     return EdgeFit(
         line=np.array([normal[0], normal[1], -normal @ foot]),
         foot_px=foot,
         covariance=_covariance(linear, weights),
         extent=(float(start), float(end)),
         blur_px=float(np.exp(state.log_blur)),
-        contrast=float(np.median(np.abs(linear.step))),
+        contrast=contrast,
+        sharpness=sharpness,
         supported=int(good.sum()),
         stretches=len(weights),
     )
+
+
+def _sharpness(pixels: _Pixels, state: _State, good: NDArray[np.bool_]) -> tuple[float, float]:
+    depth = (pixels.depth + state.offset - state.turn * pixels.along)[good]
+    grey, weight = pixels.grey[good], pixels.weight[good]
+    deepest = float(np.clip(0.8 * pixels.half_width, 2.2, 4.0))
+    means = []
+    for middle in (-1.0, 1.0, deepest):
+        near = weight * (np.abs(depth - middle) < 0.6)
+        count = near.sum(axis=1)
+        means.append(np.where(count > 0, (grey * near).sum(axis=1) / np.maximum(count, 1), np.nan))
+    with np.errstate(invalid="ignore"):
+        edge, beyond = (float(np.nanmedian(np.abs(means[i + 1] - means[i]))) for i in (0, 1))
+    if not np.isfinite(edge + beyond):
+        return 0.0, 0.0
+    return edge, edge / max(edge + beyond, 1e-9)

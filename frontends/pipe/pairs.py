@@ -68,7 +68,9 @@ def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limi
     return sorted(pairs, key=lambda pair: -pair.score)
 
 
-def _pair(first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits) -> EdgePair | None:
+def _pair(
+    first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits
+) -> EdgePair | None:
     turn, rho = _aligned(first, second)
     if abs(turn) > np.deg2rad(25.0):
         return None
@@ -109,7 +111,13 @@ def _line(angle: float, rho: float, centre: Float) -> Float:
 
 
 def _score(
-    first: EdgeLine, second: EdgeLine, width: float, middle: float, direction: float, focal_px: float, prior: OutlinePrior
+    first: EdgeLine,
+    second: EdgeLine,
+    width: float,
+    middle: float,
+    direction: float,
+    focal_px: float,
+    prior: OutlinePrior,
 ) -> float:
     score = -0.5 * (middle / prior.middle_sigma_px) ** 2
     if prior.half_width_px is None:

@@ -1,6 +1,6 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,6 +12,7 @@ from ..rays import ideal_from_raw, pixel_rays, raw_from_ideal
 from .edges import image_noise, straight_lines
 from .limb import EdgeFit, fit_edge
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
+from .surface import occlusion_score
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -74,7 +75,9 @@ class OutlineFinder:
         config = self._config
         rows, columns = self._window(prior.centre_px)
         if rows.stop - rows.start < 12 or columns.stop - columns.start < 12:
-            return self._refuse(stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0)
+            return self._refuse(
+                stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0
+            )
         grey = image[rows, columns].astype(np.float32)
         noise = image_noise(grey)
         patch, centre = self._ideal_patch(image, prior.centre_px)
@@ -83,6 +86,8 @@ class OutlineFinder:
         if not pairs:
             return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
         found = self._refined(pairs, grey.astype(float), self._ideal[rows, columns], prior, noise)
+        found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
+        found = _outermost(sorted(found, key=lambda f: -f.score))
         return self._decide(stamp_ns, pipe_id, found, prior)
 
     def _window(self, centre: Float) -> tuple[slice, slice]:
@@ -115,7 +120,9 @@ class OutlineFinder:
             return None
         return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
 
-    def _refined(self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float) -> list[_Found]:
+    def _refined(
+        self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float
+    ) -> list[_Found]:
         values, px = grey.ravel(), ideal.reshape(-1, 2)
         fits: dict[tuple[int, bool], EdgeFit | None] = {}
         found = []
@@ -131,9 +138,18 @@ class OutlineFinder:
                 both.append(fits[key])
             if both[0] is not None and both[1] is not None:
                 found.append(_Found(pair, (both[0], both[1]), pair.score + _fit_score(both[0]) + _fit_score(both[1])))
-        return sorted(found, key=lambda f: -f.score)
+        return found
 
-    def _decide(self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior) -> OutlineSighting | Rejection:
+    @staticmethod
+    def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
+        lines = np.array([fit.line for fit in found.fits])
+        feet = np.array([fit.foot_px for fit in found.fits])
+        score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
+        return replace(found, score=found.score + score)
+
+    def _decide(
+        self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior
+    ) -> OutlineSighting | Rejection:
         if not found:
             return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
         scores = np.array([f.score for f in found])
@@ -157,7 +173,9 @@ class OutlineFinder:
         lines = np.array([fit.line for fit in best.fits])
         feet = np.array([fit.foot_px for fit in best.fits])
         along = np.column_stack((-lines[:, 1], lines[:, 0]))
-        extent = np.array([[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)])
+        extent = np.array(
+            [[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)]
+        )
         covariance = np.array([fit.covariance for fit in best.fits])
         return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
 
@@ -169,9 +187,24 @@ class OutlineFinder:
         return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
 
 
+def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
+    """Lowers hypotheses that lie within another one about the same middle: a highlight has two edges as well."""
+    result = []
+    for inner in found:
+        nested = any(
+            outer.pair.width_px > inner.pair.width_px + 3.0
+            and abs(outer.pair.middle_px - inner.pair.middle_px) < 2.0
+            and outer.score > inner.score - 4.0
+            for outer in found
+        )
+        result.append(replace(inner, score=inner.score - penalty * nested))
+    return sorted(result, key=lambda f: -f.score)
+
+
 def _fit_score(fit: EdgeFit) -> float:
-    """Agreement of an edge with one sharp straight step: share of good stretches, and blur (a highlight is soft)."""
-    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * (max(np.log(fit.blur_px / 0.8), 0.0) / 0.3) ** 2
+    """Agreement of an edge with one sharp straight step: share of good stretches; shading and highlights are soft."""
+    soft = max(0.55 - fit.sharpness, 0.0) / 0.12
+    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * soft**2
 
 
 def silhouette_sighting(

@@ -27,6 +27,8 @@ class Patches:
     """Shape (n, m), normalised."""
     steps: Float32
     """Shape (n, 2, m): shift in the reference's pixels per normalised difference."""
+    normal: Float
+    """Shape (n, k, k)."""
     inverse_hessian: Float
     """Shape (n, 2, 2): covariance of the shift for unit variance of the raw difference, px^2 per grey value^2."""
     contrast: Float
@@ -34,13 +36,16 @@ class Patches:
 
     def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
         """The patches at the given indices or of the given mask."""
-        return Patches(self.values[index], self.steps[index], self.inverse_hessian[index], self.contrast[index])
+        return Patches(
+            self.values[index], self.steps[index], self.normal[index], self.inverse_hessian[index], self.contrast[index]
+        )
 
     def append(self, other: "Patches") -> "Patches":
         """These patches followed by others."""
         return Patches(
             np.concatenate((self.values, other.values)),
             np.concatenate((self.steps, other.steps)),
+            np.concatenate((self.normal, other.normal)),
             np.concatenate((self.inverse_hessian, other.inverse_hessian)),
             np.concatenate((self.contrast, other.contrast)),
         )
@@ -49,6 +54,7 @@ class Patches:
         """Replaces the patches of `mask` (n,) by others."""
         self.values[mask] = other.values
         self.steps[mask] = other.steps
+        self.normal[mask] = other.normal
         self.inverse_hessian[mask] = other.inverse_hessian
         self.contrast[mask] = other.contrast
 
@@ -68,14 +74,14 @@ class Alignment:
 
 
 class PatchGrid:
-    """Sample places and weights of a square patch."""
+    """Sample places and weights of a square patch: `radius` samples to each side, `spacing_px` apart."""
 
-    def __init__(self, radius_px: int) -> None:
-        axis = np.arange(-radius_px, radius_px + 1, dtype=np.float64)
+    def __init__(self, radius: int, spacing_px: float = 1.0, affine: bool = False, stiffness: float = 0.02) -> None:
+        self.affine, self.stiffness = affine, stiffness
+        axis = np.arange(-radius, radius + 1, dtype=np.float64) * spacing_px
         u, v = np.meshgrid(axis, axis)
-        self.radius = radius_px
         self.offsets = np.stack((u.ravel(), v.ravel()), axis=1)
-        weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius_px + 0.5)) ** 2)
+        weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
         self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
@@ -96,13 +102,23 @@ class PatchGrid:
         return centred, deviation
 
 
-def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
+def no_patches(grid: PatchGrid) -> Patches:
+    """No patch at all."""
+    m = len(grid.weights)
+    k = 6 if grid.affine else 2
+    return Patches(
+        np.zeros((0, m), np.float32),
+        np.zeros((0, k, m), np.float32),
+        np.zeros((0, k, k)),
+        np.zeros((0, 2, 2)),
+        np.zeros(0),
+    )
+
+
+def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
     """Reference patches (n) about `px` (n, 2) of a smoothed image."""
     if len(px) == 0:
-        m = len(grid.weights)
-        return Patches(
-            np.zeros((0, m), np.float32), np.zeros((0, 2, m), np.float32), np.zeros((0, 2, 2)), np.zeros(0)
-        )
+        return no_patches(grid)
     values, deviation = grid.normalise(grid.sample(image, px))
     shift = np.array([[0.5, 0.0], [0.0, 0.5]])
     gradient = np.stack(
@@ -113,17 +129,37 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid) -> Patches:
     gradient -= (gradient @ grid.weights)[:, :, None]
     along = (gradient @ (values * grid.weights)[:, :, None])[:, :, 0]
     gradient -= along[:, :, None] * values[:, None, :]
-    weighted = gradient * grid.weights
-    hessian = (weighted @ gradient.transpose(0, 2, 1)).astype(np.float64)
-    hessian += 1e-9 * np.eye(2)
+    jacobian = gradient
+    if grid.affine:
+        u, v = grid.offsets.T.astype(np.float32)
+        jacobian = np.concatenate(
+            (gradient, gradient[:, :1] * u, gradient[:, :1] * v, gradient[:, 1:] * u, gradient[:, 1:] * v), axis=1
+        )
+    size = jacobian.shape[1]
+    weighted = jacobian * grid.weights
+    hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+    stiffness = np.clip(variance / deviation.astype(np.float64) ** 2 * grid.stiffness, 0.002, 2.0)
+    hessian += stiffness[:, None, None] * np.diag(np.r_[0.0, 0.0, np.ones(size - 2)]) + 1e-9 * np.eye(size)
     inverse = np.linalg.inv(hessian)
     steps = inverse.astype(np.float32) @ weighted
-    spread = (steps @ steps.transpose(0, 2, 1)).astype(np.float64)
-    return Patches(values, steps, spread / (deviation.astype(np.float64) ** 2)[:, None, None], deviation.astype(float))
+    spread = (steps[:, :2] @ steps[:, :2].transpose(0, 2, 1)).astype(np.float64)
+    return Patches(
+        values,
+        steps,
+        inverse * stiffness[:, None, None],
+        spread / (deviation.astype(np.float64) ** 2)[:, None, None],
+        deviation.astype(float),
+    )
 
 
 def align(
-    image: Float32, patches: Patches, guess: Float, linear: Float, grid: PatchGrid, iterations: int = 6
+    image: Float32,
+    patches: Patches,
+    guess: Float,
+    linear: Float,
+    grid: PatchGrid,
+    iterations: int = 6,
+    reach_px: float = 3.0,
 ) -> Alignment:
     """Places (n, 2) in a smoothed image where the reference patches fit best, near `guess` (n, 2).
 
@@ -134,22 +170,33 @@ def align(
         linear: (n, 2, 2), derivative of this image's pixels by the reference's.
         grid: the grid that the patches were made with.
         iterations: upper limit of Gauss-Newton steps.
+        reach_px: a patch that went farther from its guess has not converged.
     """
     px = guess.copy()
     n = len(px)
     if n == 0:
         return Alignment(px, np.zeros(0), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
-    step = np.full((n, 2), np.inf)
+    size = patches.steps.shape[1]
+    step = np.full((n, size), np.inf)
+    extra = np.zeros((n, size))
     active = np.ones(n, dtype=bool)
     difference = np.zeros_like(patches.values)
+    warp = np.array(linear)
     for _ in range(iterations):
         index = np.flatnonzero(active)
-        values, _ = grid.normalise(grid.sample(image, px[index], linear[index]))
+        values, _ = grid.normalise(grid.sample(image, px[index], warp[index]))
         difference[index] = values - patches.values[index]
-        step[index] = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0]
-        limit = np.minimum(1.0, 1.5 / np.maximum(np.linalg.norm(step[index], axis=1), 1e-9))
-        px[index] -= (linear[index] @ (step[index] * limit[:, None])[:, :, None])[:, :, 0]
-        active[index] = np.linalg.norm(step[index], axis=1) > 0.01
+        move = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0].astype(np.float64)
+        if size == 6:
+            move += (patches.normal[index] @ extra[index][:, :, None])[:, :, 0]
+        length = np.linalg.norm(move[:, :2], axis=1)
+        limit = np.minimum(1.0, 1.5 / np.maximum(length, 1e-9))
+        step[index] = move
+        if size == 6:
+            extra[index, 2:] = np.clip(extra[index, 2:] - (move * limit[:, None])[:, 2:], -0.4, 0.4)
+            warp[index] = linear[index] @ (np.eye(2) + extra[index, 2:].reshape(-1, 2, 2))
+        px[index] -= (warp[index] @ (move[:, :2] * limit[:, None])[:, :, None])[:, :, 0]
+        active[index] = length > 0.01
         if not active.any():
             break
     mean_square = (difference**2) @ grid.weights
@@ -158,7 +205,7 @@ def align(
     raw_variance = mean_square * patches.contrast**2
     covariance = raw_variance[:, None, None] * (linear @ patches.inverse_hessian @ linear.transpose(0, 2, 1))
     moved = np.linalg.norm(px - guess, axis=1)
-    converged = visible & ~active & (moved < 3.0)
+    converged = visible & ~active & (moved < reach_px)
     return Alignment(px, correlation, covariance.astype(np.float64), converged)
 
 

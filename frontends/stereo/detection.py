@@ -23,7 +23,7 @@ def detect(
     """
     if wanted <= 0:
         return np.zeros((0, 2))
-    score = cv2.cornerMinEigenVal(image, 7, ksize=3)
+    score = np.asarray(cv2.cornerMinEigenVal(image, 7, ksize=3), dtype=np.float32)
     peak = cv2.dilate(score, np.ones((3, 3), np.uint8))
     # cornerMinEigenVal scales by 1 / (4 * 255 * 7)^2 per sample; 49 samples of a Sobel response with variance 12 s^2.
     floor = 49 * 12 * (noise / (4 * 255.0 * 7)) ** 2 * 4.0

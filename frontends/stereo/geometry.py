@@ -19,7 +19,7 @@ def inverse(a_T_b: Float) -> Float:
 
 def transform(a_T_b: Float, b_p: Float) -> Float:
     """Points (n, 3) of frame b in frame a."""
-    return b_p @ a_T_b[:3, :3].T + a_T_b[:3, 3]
+    return np.asarray(b_p @ a_T_b[:3, :3].T + a_T_b[:3, 3], dtype=np.float64)
 
 
 def exponential(tangent: Float) -> Float:

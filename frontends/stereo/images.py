@@ -13,13 +13,14 @@ def to_grey(image: NDArray[np.generic]) -> Image:
 
     16-bit images are shifted down by eight bits: their dark part is lost, as in the 8-bit recording of the same camera.
     """
-    if image.ndim == 3 and image.shape[2] >= 3:
-        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
-    elif image.ndim == 3:
-        image = image[:, :, 0]
     if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    return np.ascontiguousarray(image, dtype=np.uint8)
+        image = np.asarray(image, dtype=np.uint16) >> 8
+    grey = np.ascontiguousarray(image, dtype=np.uint8)
+    if grey.ndim == 2:
+        return grey
+    if grey.shape[2] == 1:
+        return np.ascontiguousarray(grey[:, :, 0])
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(grey[:, :, :3]), cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def quantiles(image: Image) -> NDArray[np.float64]:
@@ -28,14 +29,14 @@ def quantiles(image: Image) -> NDArray[np.float64]:
     return np.searchsorted(counts, np.array([0.02, 0.5, 0.98]) * counts[-1]).astype(np.float64)
 
 
-def contrast_table(levels: NDArray[np.float64], largest_gain: float = 6.0) -> Image | None:
-    """Look-up table (256,) that stretches a dark or flat image; None where the image uses its range already."""
+def contrast_table(levels: NDArray[np.float64], largest_gain: float = 6.0) -> tuple[Image, float] | None:
+    """Look-up table (256,) and its gain, that stretches a dark or flat image; None where the image uses its range already."""
     low, _, high = levels
     gain = min(largest_gain, 200.0 / max(high - low, 1.0))
     if gain < 1.5:
         return None
     table = (np.arange(256) - low) * gain + 20.0
-    return np.clip(np.rint(table), 0, 255).astype(np.uint8)
+    return np.clip(np.rint(table), 0, 255).astype(np.uint8), gain
 
 
 def brightness_table(levels_from: NDArray[np.float64], levels_to: NDArray[np.float64]) -> Image | None:
@@ -53,7 +54,7 @@ def brightness_table(levels_from: NDArray[np.float64], levels_to: NDArray[np.flo
 
 def smooth(image: Image, sigma_px: float) -> Float32:
     """Float image, low-passed; bilinear sampling of the raw image shifts by some hundredths of a pixel."""
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px)
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px), dtype=np.float32)
 
 
 def noise_sigma(image: Image) -> float:

@@ -14,8 +14,10 @@ class StereoSettings:
     flow_window_px: int = 15
     pyramid_levels: int = 3
     forward_backward_px: float = 0.7
-    patch_radius_px: int = 6
+    patch_radius_px: int = 7
     """Half size of the square patch that alignment compares."""
+    affine: bool = True
+    stiffness: float = 2.5
     smoothing_px: float = 0.7
     """Standard deviation of the Gaussian ahead of alignment; it takes the bias of bilinear sampling away."""
     min_correlation: float = 0.8
@@ -36,6 +38,10 @@ class StereoSettings:
     min_inliers: int = 12
     min_spread: float = 0.03
     """Smallest standard deviation of the inliers, in the direction of least spread, as a share of the diagonal."""
+    min_relocalisation: int = 15
+    """Inliers that a remembered place needs to count as found again."""
+    revisits: int = 80
+    """Number of old landmarks that each keyframe looks for."""
     store_keyframes: int = 400
     """Number of keyframes that are remembered for relocalisation."""
     store_landmarks: int = 20000

@@ -5,11 +5,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import Patches
+from .alignment import PatchGrid, Patches, no_patches
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+CROP_SIDE = 41
+"""Side of the surroundings kept of each reference patch: enough for a coarse patch and its low-pass."""
 
 
 @dataclass(slots=True)
@@ -33,6 +37,8 @@ class Tracks:
     """Shape (n, 3): the point in the camera that saw the reference patch."""
     patch_poses: Float
     """Shape (n, 4, 4): that camera in the front end's own chain of motions."""
+    crops: Image
+    """Shape (n, s, s): the surroundings of the reference patch in its smoothed image, for a later return."""
     ages: Int
     """Shape (n,), number of keyframes that saw the track."""
     strikes: Int
@@ -40,6 +46,10 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def take(self, index: NDArray[np.intp] | Bool) -> "Tracks":
+        """Copies of the tracks at the given indices or of the given mask."""
+        return Tracks(patches=self.patches.take(index), **{name: getattr(self, name)[index] for name in _ARRAYS})
 
     def keep(self, mask: Bool) -> None:
         """Drops the tracks outside `mask`."""
@@ -59,7 +69,7 @@ class Tracks:
 _ARRAYS = tuple(field.name for field in fields(Tracks) if field.name != "patches")
 
 
-def new_tracks(ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, pose: Float) -> Tracks:
+def new_tracks(ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, crops: Image, pose: Float) -> Tracks:
     """Tracks that begin at a keyframe with the given pose in the chain; without points yet."""
     n = len(ids)
     return Tracks(
@@ -72,6 +82,14 @@ def new_tracks(ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, pose:
         patches=patches,
         patch_points=np.full((n, 3), np.nan),
         patch_poses=np.broadcast_to(pose, (n, 4, 4)).copy(),
+        crops=crops,
         ages=np.ones(n, dtype=np.int64),
         strikes=np.zeros(n, dtype=np.int64),
     )
+
+
+def no_tracks(grid: PatchGrid) -> Tracks:
+    """No track at all, for patches of the given grid."""
+    none = np.zeros((0, 2))
+    ids = np.zeros(0, dtype=np.int64)
+    return new_tracks(ids, none, none, no_patches(grid), np.zeros((0, CROP_SIDE, CROP_SIDE), np.uint8), np.eye(4))

@@ -9,7 +9,17 @@ from .geometry import Float, StereoGeometry, project
 
 def transform_each(a_T_b: Float, b_p: Float) -> Float:
     """Points (n, 3), each with a pose (n, 4, 4) of its own."""
-    return np.einsum("nij,nj->ni", a_T_b[:, :3, :3], b_p) + a_T_b[:, :3, 3]
+    return (a_T_b[:, :3, :3] @ b_p[:, :, None])[:, :, 0] + a_T_b[:, :3, 3]
+
+
+def inverse_each(poses: Float) -> Float:
+    """Inverses of poses (n, 4, 4)."""
+    out = np.zeros_like(poses)
+    rotation = poses[:, :3, :3].transpose(0, 2, 1)
+    out[:, :3, :3] = rotation
+    out[:, :3, 3] = -(rotation @ poses[:, :3, 3, None])[:, :, 0]
+    out[:, 3, 3] = 1.0
+    return out
 
 
 def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) -> tuple[Float, Float]:
@@ -22,7 +32,7 @@ def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) 
         this_T_patch: (n, 4, 4), pose of that camera in this left camera.
         rig: nominal geometry.
     """
-    known = np.isfinite(patch_points).all(axis=1)
+    known = np.asarray(np.isfinite(patch_points).all(axis=1))
     points = np.where(known[:, None], patch_points, [0.0, 0.0, 1.0])
     moved = np.zeros((3, len(points), 3))
     moved[:] = points
