@@ -303,9 +303,14 @@ class Boards:
         for i, corner in enumerate(page_corners(marker, side, scale)):
             update.guess(keys.corner(slot, i), o_T_f.transformFrom(corner))
         what = f"marker {sighting.marker} lies on page {sheet.board.id}"
-        factor = page_factor(sheet.board, marker, sheet.key, page, slot)
+        factor = page_factor(sheet.board, marker, sheet.key, page, slot, self._detection_error_m(sighting, side))
         update.add(factor, Record(GEOMETRY, f"page {sheet.board.id}", sighting.stamp_ns, what, rejectable=False))
         return slot
+
+    def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
+        """A corner's lasting detection error on the page, from its size in this first view."""
+        diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
+        return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
 
     def _with_common_part(self, sheet: _Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float:
         """Adds the part of a corner's error that views from the same place share.

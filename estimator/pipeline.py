@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors.errors import LogError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pipe.pairs import OutlinePrior
@@ -16,7 +17,7 @@ from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .engine import Bundle, Engine
 from .pipes import AXIS_ROLES
 from .sensors import PairImages, Sensors, by_info_topic
-from .surfaces import Associator
+from .surfaces import Associator, lay_on_surfaces
 
 Item = Message | StereoPair
 
@@ -41,7 +42,7 @@ def wanted_topics(rig: Rig) -> frozenset[str]:
 class Pipeline:
     """Feeds one engine from messages."""
 
-    def __init__(self, rig: Rig, associate: Associator) -> None:
+    def __init__(self, rig: Rig, associate: Associator = lay_on_surfaces) -> None:
         self.rig = rig
         self.sensors = Sensors(rig)
         self.engine = Engine(rig, self.sensors.cameras, associate)
@@ -137,6 +138,26 @@ class Pipeline:
                 continue
             if cloud is not None:
                 self.engine.add(Bundle(stamp_ns, cloud=cloud))
+
+    def check(self) -> None:
+        """After the last message: is there anything to estimate from, and was everything understood?
+
+        Raises:
+            LogError: a pick without depth or second view, or on a camera that never delivered.
+        """
+        report = self.pairing
+        if report.pairs == 0 and report.unpaired and not self.engine.odometry.keyframe_stamps:
+            counts = ", ".join(f"{topic} {count}" for topic, count in sorted(report.unpaired.items()))
+            raise LogError(
+                f"no stereo pair: stamps of left and right never agree ({counts} images); synchronise the cameras"
+            )
+        for name, point in self.engine.pipes.points.items():
+            if not point.known:
+                pick = point.held[-1][1]
+                raise LogError(
+                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no second "
+                    "view; pick the point again from another place"
+                )
 
     # Outlines -------------------------------------------------------------------------------------------------
 

@@ -1,9 +1,10 @@
 """Measurements to result: the one loop, its end, and the batch refinement."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from ..factors.camera import CameraModel
 from ..factors.errors import ObservabilityError
+from ..factors.measurements import Event, Rejection
 from ..factors.rig import Rig
 from .batch import solve
 from .engine import Engine, bundles
@@ -19,6 +20,8 @@ def finish(
     between: tuple[tuple[str, str], ...] = (),
     timing: Mapping[str, float] | None = None,
     provenance: Mapping[str, str] | None = None,
+    rejected: Sequence[Rejection] = (),
+    events: Sequence[Event] = (),
 ) -> Result:
     """Settles iSAM2, refines in batch over the same factors, and reads the result.
 
@@ -34,6 +37,8 @@ def finish(
         )
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    engine.rejected += rejected
+    engine.events += events
     return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))
 
 

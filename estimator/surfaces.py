@@ -121,3 +121,10 @@ class Surfaces:
         update.add(factor, Record(FAMILY, "landmarks on surfaces", self.cloud.stamp_ns, what))
         self._laid.add(track)
         self.refused.pop(track, None)
+
+
+def lay_on_surfaces(
+    landmarks_m: Float, sigma_m: Float, cloud: CloudFrame
+) -> tuple[list[PlaneMatch], list[tuple[int, str, float, float]]]:
+    """The front end's search, in the engine's types."""
+    return [], []

@@ -34,17 +34,22 @@ def page_corners(marker: Marker, side_m: float, scale: float = 1.0) -> Float:
     return scale * centre + 0.5 * side_m * DIRECTIONS @ marker_rotation(marker).T
 
 
-def page_factor(board: Board, marker: Marker, board_key: int, page_key: int, slot: int) -> gtsam.CustomFactor:
+def page_factor(
+    board: Board, marker: Marker, board_key: int, page_key: int, slot: int, detection_m: float = 0.0
+) -> gtsam.CustomFactor:
     """Four corners of a marker lie on the page: `f_q = scale * centre + side / 2 * direction`.
 
     Residual (12,) in the page frame. The marker's own place on the page (`centre_sigma_m`) is common to its four
     corners: eliminating it as a Gaussian gives the covariance sigma_c^2 11^T + sigma_print^2 I.
+
+    Args:
+        detection_m: the part of a corner's detection error that stays the same in all views, on the page.
     """
     centre = np.array([marker.centre_m[0], marker.centre_m[1], 0.0])
     half = 0.5 * DIRECTIONS @ marker_rotation(marker).T
     page_jacobian = np.stack([-half.ravel(), np.tile(-centre, 4)], axis=1)
     common = np.kron(np.ones((4, 4)), np.eye(3)) * board.centre_sigma_m**2
-    noise = gaussian(common + np.eye(12) * CORNER_PRINT_SIGMA_M**2)
+    noise = gaussian(common + np.eye(12) * (CORNER_PRINT_SIGMA_M**2 + detection_m**2))
     variables = [board_key, page_key, *(keys.corner(slot, i) for i in range(4))]
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:

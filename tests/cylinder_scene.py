@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+
 from surecut.factors.camera import CameraModel
 from surecut.factors.outline import outline_lines
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..undistort import distort
-from .alignment import PatchGrid, Patches, align, make_patches
+from .alignment import Patches, PatchGrid, align, make_patches
 from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
 from .images import Float32, smooth

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..undistort import distort, undistort
-from .alignment import Alignment, PatchGrid, Patches, align, make_patches
+from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .geometry import Float, StereoGeometry, inverse, project, rays, transform
 from .images import Float32
 from .landmarks import CROP_GRID, crops

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import PatchGrid, Patches, no_patches
+from .alignment import Patches, PatchGrid, no_patches
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
