@@ -114,7 +114,8 @@ class View:
         stage = self.stage
         uv = np.take(stage.uv, hits.triangle, axis=0)
         a, b = hits.barycentric[:, 0], hits.barycentric[:, 1]
-        texels = np.stack([uv[:, 0] + a * uv[:, 2] + b * uv[:, 4], uv[:, 1] + a * uv[:, 3] + b * uv[:, 5]])
+        along = uv[:, 0] + a * uv[:, 2] + b * uv[:, 4], uv[:, 1] + a * uv[:, 3] + b * uv[:, 5]
+        texels = np.stack(along).astype(np.float32, copy=False)
         direction = rays[:, 3:]
         cosine = np.abs(np.einsum("ij,ij->i", hits.flat_normal, direction))
         cosine /= np.sqrt(np.einsum("ij,ij->i", direction, direction))
