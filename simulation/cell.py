@@ -143,8 +143,8 @@ def _panel(scenario: Scenario, pipe: PipeTruth, rng: np.random.Generator) -> lis
     if not scenario.pipe.hidden:
         return []
     share = 0.75 / pipe.at_height(1.1)[1]
-    reach = [pipe.at_height(z)[0] * share for z in (0.0, 2.0)]
-    left, right = min(reach) - 0.13 - pipe.radius_m, max(reach) + 0.13 + pipe.radius_m
+    reach = [pipe.at_height(z)[0] * share for z in (0.2, 1.9)]
+    left, right = min(reach) - 0.11 - pipe.radius_m, max(reach) + 0.11 + pipe.radius_m
     size = (right - left, 0.03, rng.uniform(1.9, 2.1))
     look = textures.plain(rng.uniform(0.45, 0.65), 0.008, 0.02)
     return [

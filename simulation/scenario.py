@@ -175,6 +175,8 @@ class Scenario(Section):
     bias: Bias = Bias()
     timeline: Timeline = Timeline()
     picks: PickOptions = PickOptions()
+    detail: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """Fineness of the textures (the page is always fine); lower starts faster, higher suits large images."""
 
     @model_validator(mode="after")
     def _long_enough(self) -> Self:

@@ -126,7 +126,7 @@ def prepare(scenario: Scenario, seed: int) -> Session:
     rig = draw_rig(scenario, side, generator(seed, 1))
     cell = build_cell(scenario, rig.truth, side, generator(seed, 2))
     motion = Motion(scenario, cell, _stations(side, generator(seed, 3)))
-    stage = build_stage(cell.bodies, cell.lamps, motion.poses(0.0), generator(seed, 4))
+    stage = build_stage(cell.bodies, cell.lamps, motion.poses(0.0), generator(seed, 4), scenario.detail)
     best: Session | None = None
     for attempt in range(_ATTEMPTS):
         trajectory = plan(scenario, cell, motion.chassis(0.0), generator(seed, 5, scenario.initialisation, attempt))

@@ -25,21 +25,29 @@ def _limited(image: NDArray[Any], low: float = 0.02, high: float = 0.9) -> Image
 
 def clouds(shape: tuple[int, int], texel_m: float, coarsest_m: float, octaves: int, fall: float, rng: Rng) -> Image:
     """Smooth noise of several octaves, about zero mean and unit deviation, from `coarsest_m` downwards."""
-    total = np.zeros(shape, np.float32)
+    # Coarse octaves are made at a quarter of the resolution.
+    small_shape = (shape[0] // 4 + 2, shape[1] // 4 + 2)
+    coarse, fine = np.zeros(small_shape, np.float32), np.zeros(shape, np.float32)
     weight = 0.0
     for octave in range(octaves):
         cell = max(coarsest_m / 2**octave / texel_m, 1.0)
-        small = rng.standard_normal([int(n / cell) + 3 for n in shape]).astype(np.float32)
-        # A random shift keeps the grids of the octaves from lining up.
-        shift = rng.random(2)
-        matrix = np.array([[1 / cell, 0, shift[0]], [0, 1 / cell, shift[1]]])
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        layer = cv2.warpAffine(small, matrix, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REFLECT)
-        total += fall**octave * layer
+        target = coarse if cell > 24 else fine
+        target += fall**octave * _waves(target.shape, cell / 4 if cell > 24 else cell, rng)
         weight += fall ** (2 * octave)
         if cell <= 1.0:
             break
-    return total / np.float32(0.75 * np.sqrt(weight))
+    wide = cv2.resize(coarse, (small_shape[1] * 4, small_shape[0] * 4), interpolation=cv2.INTER_LINEAR)
+    return (fine + wide[: shape[0], : shape[1]]) / np.float32(0.75 * np.sqrt(weight))
+
+
+def _waves(shape: tuple[int, ...], cell: float, rng: Rng) -> Image:
+    """One octave: a grid of random numbers `cell` texels apart, shifted at random so that octaves do not line up."""
+    small = rng.standard_normal([int(n / cell) + 3 for n in shape]).astype(np.float32)
+    shift = rng.random(2)
+    matrix = np.array([[1 / cell, 0, shift[0]], [0, 1 / cell, shift[1]]])
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    size_px = (shape[1], shape[0])
+    return np.asarray(cv2.warpAffine(small, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REFLECT), np.float32)
 
 
 def plain(level: float = 0.5, grain: float = 0.02, blotch: float = 0.03) -> Callable[..., Image]:
