@@ -15,6 +15,7 @@ from .surfaces import Body, Patch
 
 Float = NDArray[np.float64]
 FINE_PRINT_M = 0.0005
+_CHUNK = 400_000
 Poses = Mapping[str, Float]
 """Body name -> `w_T_body`, shape (4, 4)."""
 
@@ -111,6 +112,10 @@ class View:
             rays: shape (n, 6).
             spread: size of a sample at distance 1, in lengths of the direction (1 / focal length in samples).
         """
+        parts = [rays[i : i + _CHUNK] for i in range(0, len(rays), _CHUNK)]
+        return np.concatenate([self._radiance(part, spread, colour) for part in parts])
+
+    def _radiance(self, rays: NDArray[np.float32], spread: float, colour: bool) -> NDArray[np.float32]:
         hits = self.cast(rays)
         stage = self.stage
         uv = np.take(stage.uv, hits.triangle, axis=0)

@@ -2,7 +2,9 @@
 
 import cv2
 import numpy as np
+
 from surecut.simulation.scenario import Scenario
+from surecut.simulation.sensor import directions, project
 
 
 def small(**changes) -> Scenario:
@@ -17,10 +19,11 @@ def small(**changes) -> Scenario:
     return Scenario.model_validate({**data, **changes})
 
 
-def edge_corners(image, guess):
+def edge_corners(image, guess, lens):
     """Corners of a dark quadrilateral in a noise-free linear image, shape (4, 2).
 
-    Every side is sampled across at many places; the half-way crossings are fitted by a line, lines are cut.
+    Every side is sampled across at many places; the half-way crossings, their distortion undone, are fitted by a line;
+    lines are cut. The windows stay inside the marker's black border.
     """
     lines = []
     for k in range(4):
@@ -29,7 +32,8 @@ def edge_corners(image, guess):
         normal = np.array([-along[1], along[0]])
         points = []
         for share in np.linspace(0.15, 0.85, 41):
-            steps = np.linspace(-5, 5, 81)
+            reach = 0.13 * np.linalg.norm(b - a)
+            steps = np.linspace(-reach, reach, 81)
             line = a + share * (b - a) + steps[:, None] * normal
             x, y = line[:, 0].astype(np.float32)[None], line[:, 1].astype(np.float32)[None]
             profile = cv2.remap(image, x, y, cv2.INTER_LINEAR)[0]
@@ -39,12 +43,12 @@ def edge_corners(image, guess):
             assert len(change) == 1
             i = change[0]
             t = (level - profile[i]) / (profile[i + 1] - profile[i])
-            points.append(a + share * (b - a) + (steps[i] + t * 0.125) * normal)
-        points = np.array(points)
+            points.append(a + share * (b - a) + (steps[i] + t * (steps[1] - steps[0])) * normal)
+        points = directions(lens, np.array(points))[:, :2]
         centre = points.mean(axis=0)
         lines.append((centre, np.linalg.svd(points - centre)[2][1]))
     corners = []
     for k in range(4):
         (p, n), (q, m) = lines[k - 1], lines[k]
         corners.append(np.linalg.solve(np.stack([n, m]), np.array([n @ p, m @ q])))
-    return np.array(corners)
+    return project(lens, np.concatenate([corners, np.ones((4, 1))], axis=1))
