@@ -74,6 +74,8 @@ class CloudFrame:
     """Shape (n,), standard deviation along the normal."""
     planarity_m: Float
     """Shape (n,), rms of the neighbourhood about its plane."""
+    bias_m: Float
+    """Shape (n,), the part of `sigma_m` that neighbours share (quantisation): it does not average out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,32 @@ class CylinderSighting:
     inliers: int
     rms_m: float
     source: Literal["silhouette", "stereo_cloud", "kinect_cloud"]
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineSighting:
+    """The two occluding edges of a pipe in one image, left and right of its axis.
+
+    A line is l = (l0, l1, l2) with l0^2 + l1^2 = 1 and l . (u, v, 1) = 0 on the edge, in ideal pixels; it is positive
+    outside the pipe. The plane through the camera centre and the edge touches the cylinder: with the unit normal
+    n ~ K^T l, every point p of the axis has n . p = -radius (camera frame, see `factors.outline`).
+    """
+
+    stamp_ns: int
+    camera: CameraName
+    pipe_id: str
+    lines: Float
+    """Shape (2, 3)."""
+    covariance: Float
+    """Shape (2, 2, 2), of each line's (offset in px along (l0, l1) at the foot, direction in rad, about the foot)."""
+    foot_px: Float
+    """Shape (2, 2): the point of each line that its covariance refers to."""
+    extent_px: Float
+    """Shape (2, 2, 2): first and last supported point of each line."""
+    pick_px: Float
+    """Shape (2,), the pick, or the predicted middle of the outline, that the search began at."""
+    quality: float
+    """Probability that no other pair of edges is the outline, by the search's own score (0 to 1)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,26 @@
-"""The one place that imports open3d: it takes two seconds and wants libusb, which bare machines lack."""
+"""The one place that imports open3d: it takes seconds, and its wheel needs a libusb that a bare machine lacks."""
 
 import ctypes
+import importlib
 from types import ModuleType
 
-import libusb_package
+from ..factors.errors import SurecutError
 
 
 def load_open3d() -> ModuleType:
-    """open3d, after the libusb of the `libusb_package` wheel has been loaded for it.
+    """The module `open3d`, with the libusb that its shared library asks for loaded before it.
 
-    Call it inside functions that process clouds, never at import time.
+    Raises:
+        SurecutError: open3d or libusb cannot be loaded.
     """
-    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    import open3d
+    try:
+        import libusb_package
 
-    return open3d
+        path = libusb_package.get_library_path()
+        if path is not None:
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise SurecutError(
+            f"open3d cannot be loaded ({' '.join(str(error).split())}); install surecut with its dependencies again"
+        ) from error

@@ -21,7 +21,7 @@ _CHANNELS = {"mono8": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "mono16":
 _DTYPES = {"mono16": np.uint16, "16UC1": np.uint16, "32FC1": np.float32}
 
 
-def make(type_name: str, *fields: object) -> RosMessage:
+def make(type_name: str, *fields: Any) -> RosMessage:
     """A message of a type in the store, its fields in the order of the definition."""
     return typestore().types[type_name](*fields)
 

@@ -32,13 +32,14 @@ def point_cloud2(stamp_ns: int, frame_id: str, columns: Mapping[str, NDArray[Any
     layout = np.dtype([(name, array.dtype.newbyteorder("<")) for name, array in arrays.items()])
     table = np.zeros(count, dtype=layout)
     fields = []
+    offset = 0
     for name, array in arrays.items():
-        dtype, offset = (layout.fields or {})[name][:2]
-        kind = dtype.str[1:]
+        kind = array.dtype.str[1:]
         if kind not in _POINT_FIELD_TYPES:
             raise ValueError(f"column {name} has type {array.dtype}")
         table[name] = array
         fields.append(make("sensor_msgs/msg/PointField", name, offset, _POINT_FIELD_TYPES[kind], 1))
+        offset += array.dtype.itemsize
     dense = all(bool(np.isfinite(array).all()) for array in arrays.values())
     data = table.view(np.uint8).reshape(-1)
     return make(

@@ -1,0 +1,1 @@
+"""Depth images and clouds: surface samples, association, registration, base motion."""

@@ -1,0 +1,1 @@
+"""Pipes: cylinders from points, outlines from images."""

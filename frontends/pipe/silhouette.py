@@ -1,0 +1,223 @@
+"""The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...factors.camera import CameraModel
+from ...factors.measurements import CameraName, OutlineSighting, Rejection
+from ..rays import ideal_from_raw, pixel_rays, raw_from_ideal
+from .edges import image_noise, straight_lines
+from .limb import EdgeFit, fit_edge
+from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
+from .surface import occlusion_score
+
+Float = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True)
+class OutlineConfig:
+    """What counts as an outline."""
+
+    reach_px: float = 80.0
+    """Edges are followed so far from the centre."""
+    click_sigma_px: float = 1.5
+    limits: PairLimits = PairLimits()
+    refined_pairs: int = 6
+    """Hypotheses that get the sub-pixel fit."""
+    lowest_quality: float = 0.8
+    largest_sigma_px: float = 0.5
+    """An edge whose place is less sure than this is no measurement."""
+    shortest_px: float = 14.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A hypothesis with its sub-pixel edges."""
+
+    pair: EdgePair
+    fits: tuple[EdgeFit, EdgeFit]
+    score: float
+
+
+class OutlineFinder:
+    """Finds pipe outlines in images of one camera. Holds the lens table only."""
+
+    def __init__(self, camera: CameraModel, config: OutlineConfig | None = None) -> None:
+        self._camera = camera
+        self._config = config or OutlineConfig()
+        self._ideal = pixel_rays(camera) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+    def near_pick(
+        self, stamp_ns: int, pipe_id: str, image: Grey, pick_px: Float, expected_radius_px: tuple[float, float] | None = None,
+        axis_hint_px: Float | None = None,
+    ) -> OutlineSighting | Rejection:  # fmt: skip
+        """The outline about an operator's pick.
+
+        Args:
+            stamp_ns: Time of the image.
+            pipe_id: Which pipe.
+            image: Shape (height, width), grey, as recorded (distorted).
+            pick_px: Shape (2,), ideal pixels, on the middle of the visible outline to the click's sigma.
+            expected_radius_px: Half the outline's width and its sigma, px, where the diameter is known.
+            axis_hint_px: Shape (2,), direction of the pipe in the image, good to 10 degrees.
+        """
+        width, width_sigma = expected_radius_px or (None, 0.0)
+        direction = None if axis_hint_px is None else float(np.arctan2(axis_hint_px[1], axis_hint_px[0]))
+        prior = OutlinePrior(pick_px, self._config.click_sigma_px, width, width_sigma, direction, np.deg2rad(10.0))
+        return self.find(stamp_ns, pipe_id, image, prior)
+
+    def find(self, stamp_ns: int, pipe_id: str, image: Grey, prior: OutlinePrior) -> OutlineSighting | Rejection:
+        """The outline that a prior describes, or why there is none."""
+        config = self._config
+        rows, columns = self._window(prior.centre_px)
+        if rows.stop - rows.start < 12 or columns.stop - columns.start < 12:
+            return self._refuse(
+                stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0
+            )
+        grey = image[rows, columns].astype(np.float32)
+        noise = image_noise(grey)
+        patch, centre = self._ideal_patch(image, prior.centre_px)
+        lines = straight_lines(patch, centre, noise, self._widest(prior), self._angles(prior))
+        pairs = edge_pairs(lines, prior, self._camera.fx, config.limits)
+        if not pairs:
+            return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
+        found = self._refined(pairs, grey.astype(float), self._ideal[rows, columns], prior, noise)
+        found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
+        found = _outermost(sorted(found, key=lambda f: -f.score))
+        return self._decide(stamp_ns, pipe_id, found, prior)
+
+    def _window(self, centre: Float) -> tuple[slice, slice]:
+        distance = np.abs(self._ideal - centre).max(axis=2)
+        reach = self._config.reach_px
+        near = distance < reach
+        rows, columns = np.nonzero(near.any(axis=1))[0], np.nonzero(near.any(axis=0))[0]
+        if len(rows) == 0:
+            return slice(0, 0), slice(0, 0)
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    def _ideal_patch(self, image: Grey, centre: Float) -> tuple[NDArray[np.float32], Float]:
+        """The surroundings of a place in ideal pixels, NaN outside the image, and the place in the patch."""
+        half = int(np.ceil(1.5 * self._config.reach_px))
+        corner = np.floor(centre) - half
+        grid = np.stack(np.meshgrid(*(np.arange(2 * half + 2, dtype=float),) * 2), axis=2) + corner
+        raw = raw_from_ideal(grid.reshape(-1, 2), self._camera).astype(np.float32).reshape(grid.shape)
+        patch = cv2.remap(image.astype(np.float32), raw, None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, np.nan)
+        return patch, centre - corner
+
+    def _widest(self, prior: OutlinePrior) -> float:
+        limit = 0.5 * self._config.limits.widest_px
+        if prior.half_width_px is not None:
+            limit = min(limit, prior.half_width_px + 4 * prior.half_width_sigma_px)
+        return limit + 3 * prior.middle_sigma_px
+
+    @staticmethod
+    def _angles(prior: OutlinePrior) -> tuple[float, float] | None:
+        if prior.direction_rad is None:
+            return None
+        return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
+
+    def _refined(
+        self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float
+    ) -> list[_Found]:
+        values, px = grey.ravel(), ideal.reshape(-1, 2)
+        fits: dict[tuple[int, bool], EdgeFit | None] = {}
+        found = []
+        for pair in pairs[: self._config.refined_pairs]:
+            both = []
+            for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
+                foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
+                key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
+                if key not in fits:
+                    span = edge.span if key[1] else (-edge.span[1], -edge.span[0])
+                    span = (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0))
+                    fits[key] = fit_edge(values, px, line, foot, span, 0.5 * pair.width_px, noise)
+                both.append(fits[key])
+            if both[0] is not None and both[1] is not None:
+                found.append(_Found(pair, (both[0], both[1]), pair.score + _fit_score(both[0]) + _fit_score(both[1])))
+        return found
+
+    @staticmethod
+    def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
+        lines = np.array([fit.line for fit in found.fits])
+        feet = np.array([fit.foot_px for fit in found.fits])
+        score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
+        return replace(found, score=found.score + score)
+
+    def _decide(
+        self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior
+    ) -> OutlineSighting | Rejection:
+        if not found:
+            return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
+        scores = np.array([f.score for f in found])
+        share = np.exp(scores - scores.max())
+        quality = float(share[0] / share.sum())
+        if quality < self._config.lowest_quality:
+            return self._refuse(stamp_ns, pipe_id, "outline is ambiguous, probability of the best pair of edges",
+                                quality, self._config.lowest_quality)  # fmt: skip
+        best = found[0]
+        sigma = max(float(np.sqrt(fit.covariance[0, 0])) for fit in best.fits)
+        if sigma > self._config.largest_sigma_px:
+            return self._refuse(stamp_ns, pipe_id, "edge is unsure, sigma in px", sigma, self._config.largest_sigma_px)
+        length = min(fit.extent[1] - fit.extent[0] for fit in best.fits)
+        if length < self._config.shortest_px:
+            return self._refuse(stamp_ns, pipe_id, "edge is short, px", length, self._config.shortest_px)
+        return self._sighting(stamp_ns, pipe_id, best, prior, quality)
+
+    def _sighting(
+        self, stamp_ns: int, pipe_id: str, best: _Found, prior: OutlinePrior, quality: float
+    ) -> OutlineSighting:
+        lines = np.array([fit.line for fit in best.fits])
+        feet = np.array([fit.foot_px for fit in best.fits])
+        along = np.column_stack((-lines[:, 1], lines[:, 0]))
+        extent = np.array(
+            [[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)]
+        )
+        covariance = np.array([fit.covariance for fit in best.fits])
+        return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
+
+    @property
+    def _name(self) -> CameraName:
+        return self._camera.name  # type: ignore[return-value]
+
+    def _refuse(self, stamp_ns: int, pipe_id: str, reason: str, value: float, limit: float) -> Rejection:
+        return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
+
+
+def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
+    """Lowers hypotheses that lie within another one about the same middle: a highlight has two edges as well."""
+    result = []
+    for inner in found:
+        nested = any(
+            outer.pair.width_px > inner.pair.width_px + 3.0
+            and abs(outer.pair.middle_px - inner.pair.middle_px) < 2.0
+            and outer.score > inner.score - 4.0
+            for outer in found
+        )
+        result.append(replace(inner, score=inner.score - penalty * nested))
+    return sorted(result, key=lambda f: -f.score)
+
+
+def _fit_score(fit: EdgeFit) -> float:
+    """Agreement of an edge with one sharp straight step: share of good stretches; shading and highlights are soft."""
+    soft = max(0.55 - fit.sharpness, 0.0) / 0.12
+    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * soft**2
+
+
+def silhouette_sighting(
+    image: Grey,
+    camera: CameraModel,
+    pick_px: Float,
+    expected_radius_px: tuple[float, float] | None = None,
+    axis_hint_px: Float | None = None,
+    *,
+    raw: bool = False,
+    stamp_ns: int = 0,
+    pipe_id: str = "pipe0",
+) -> OutlineSighting | Rejection:
+    """The outline about one pick in one image; see `OutlineFinder.near_pick`. With `raw` the pick is a raw pixel."""
+    pick = ideal_from_raw(pick_px[None], camera)[0] if raw else pick_px
+    return OutlineFinder(camera).near_pick(stamp_ns, pipe_id, image, pick, expected_radius_px, axis_hint_px)
