@@ -52,7 +52,7 @@ def test_motion_blur_is_centred_on_the_stamp(page):
 
     expected = project(lens, transform(inverse(f_T_camera), marker.corners_m()))
     blurred = render_light(view, ray_grid(lens), pose, 0.008)
-    assert np.abs(edge_corners(blurred, expected, lens) - expected).max() < 0.15
+    assert np.abs(edge_corners(blurred, expected, lens) - expected).max() < 0.1
 
 
 def test_rays_and_projection_are_inverse():
