@@ -28,6 +28,19 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class NearestSurface:
+    """The mapped surface next to a point that is not the point's own pipe."""
+
+    what: str
+    distance_m: float
+    """From the point (on the axis, where there is one) to the surface."""
+    sigma_m: float
+    """Of the distance, from the joint of point and surface."""
+    direction: Float
+    """Shape (3,), unit, from the point to the surface, in the point's frame."""
+
+
+@dataclass(frozen=True, slots=True)
 class PointEstimate:
     """A pipe point in the robot's frame."""
 
@@ -47,6 +60,8 @@ class PointEstimate:
     pipe_id: str | None = None
     budget: dict[str, Float] = field(default_factory=dict)
     """Contribution of each source to `covariance_m2`, shape (3, 3) each; they sum to it exactly."""
+    nearest_surface: NearestSurface | None = None
+    """None: the map was not asked, or shows nothing but the pipe itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +132,35 @@ class DistanceEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class Advice:
+    """A further measurement, and what it is predicted to do for one point."""
+
+    action: str
+    """What to do, as an order to the operator."""
+    detail: str
+    """From where, how often, with what."""
+    predicted_radius95_m: float
+    """The point's `radius95_m` once the predicted factors are in the graph."""
+    gain: float
+    """1 less the ratio of predicted and present radius: 0 changes nothing, 1 removes all doubt."""
+
+
+@dataclass(frozen=True, slots=True)
+class PickView:
+    """The image that was clicked, with the estimate's uncertainty as that camera sees it."""
+
+    camera: str
+    stamp_ns: int
+    point_id: str
+    image: bytes
+    """PNG or JPEG, whole or cut out round the pick."""
+    pixel: Float
+    """Shape (2,), the estimate in this image, OpenCV convention."""
+    ellipse_px2: Float
+    """Shape (2, 2), covariance of the estimate in this image."""
+
+
+@dataclass(frozen=True, slots=True)
 class Result:
     """Everything that was estimated from one recording."""
 
@@ -140,3 +184,6 @@ class Result:
     """The effective rig."""
     last_board_view_ns: int | None
     end_ns: int
+    advice: dict[str, tuple[Advice, ...]] = field(default_factory=dict)
+    """What to measure next, by point id, best first."""
+    pick_views: tuple[PickView, ...] = ()

@@ -37,7 +37,9 @@ class Camera(Section):
     markers_topic: str | None = None
     focal_sigma_rel: NonNegative = 0.003
     centre_sigma_px: NonNegative = 1.0
-    freeze: tuple[Literal["focal", "centre"], ...] = ()
+    distortion_sigma: NonNegative = 0.002
+    """What the given lens model leaves over: sigma of its radial coefficients, at 45 degrees from the axis."""
+    freeze: tuple[Literal["focal", "centre", "distortion"], ...] = ()
 
 
 class Cameras(Section):
@@ -157,8 +159,8 @@ class Gates(Section):
     """When a measurement is refused (chi-square probabilities) and how hard large residuals are softened."""
 
     gate_probability: Annotated[float, Field(gt=0, lt=1)] = 1e-4
-    robust_sigma: Positive = 1.8
-    """Scale of the robust loss, in sigmas."""
+    robust_sigma: Positive = 2.5
+    """Where the robust loss begins, in sigmas of one dimension; more dimensions: the same probability."""
 
 
 class Box(Section):
@@ -180,6 +182,9 @@ class Cut(Section):
     tool_sigma_m: NonNegative = 0.002
     """Standard deviation of the tool centre against its command, per axis: robot and tool together."""
     wrong_go_probability: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    board_age_limit_s: Positive = 120.0
+    """Longest time since a board was last seen. After it nobody has looked whether the machine still stands where it
+    stood. The default is an agreement, not a measurement: time to put the camera down, click and read the report."""
 
 
 class Pipe(Section):
@@ -198,7 +203,7 @@ class Rig(Section):
     cameras: Cameras = Cameras()
     stereo: Stereo = Stereo()
     kinect: Kinect = Kinect()
-    boards: tuple[Board, ...] = Field(min_length=1)
+    boards: tuple[Board, ...] = ()
     distances: tuple[Distance, ...] = ()
     mount: Mount | None = None
     world_board: WorldBoard | None = None

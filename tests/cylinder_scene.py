@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+
 from surecut.factors.camera import CameraModel
 from surecut.factors.outline import outline_lines
 
@@ -109,12 +110,16 @@ def shade(scene, rays):
         view = -rays[win] / np.linalg.norm(rays[win], axis=1, keepdims=True)
         half = view + light
         half /= np.linalg.norm(half, axis=1, keepdims=True)
-        lit = c.albedo * (scene.ambient + np.maximum(n @ light, 0)) + c.specular * np.maximum((n * half).sum(1), 0) ** 40
+        lit = (
+            c.albedo * (scene.ambient + np.maximum(n @ light, 0)) + c.specular * np.maximum((n * half).sum(1), 0) ** 40
+        )
         if c.rust:
             e = np.cross(c.axis, [0.3, 0.5, 0.8])
             e /= np.linalg.norm(e)
             phi = np.arctan2(n @ np.cross(c.axis, e), n @ e)
-            waves = sum(np.sin(rng.uniform(5, 60) * s[win] + rng.integers(1, 6) * phi + rng.uniform(0, 6)) for _ in range(8))
+            waves = sum(
+                np.sin(rng.uniform(5, 60) * s[win] + rng.integers(1, 6) * phi + rng.uniform(0, 6)) for _ in range(8)
+            )
             lit = lit * (1 + c.rust * waves / 4)
         value[win] = lit
         best = np.minimum(best, t)
@@ -177,20 +182,45 @@ def random_case(rng, difficulty=1.0):
     side /= np.linalg.norm(side)
     if rng.random() < 0.4 * difficulty:  # a neighbour, nearly parallel
         gap = rng.uniform(3.5, 7) * radius * rng.choice([-1, 1])
-        cylinders.append(Cylinder(point + side * gap + np.array([0, 0, rng.uniform(0, 0.1)]), pipe.axis + rng.normal(0, 0.02, 3),
-                                  rng.uniform(0.02, 0.06), rng.uniform(0.2, 0.9), 0.3))
+        cylinders.append(
+            Cylinder(
+                point + side * gap + np.array([0, 0, rng.uniform(0, 0.1)]),
+                pipe.axis + rng.normal(0, 0.02, 3),
+                rng.uniform(0.02, 0.06),
+                rng.uniform(0.2, 0.9),
+                0.3,
+            )
+        )
     if rng.random() < 0.4 * difficulty:  # flanges
         at = rng.uniform(0.08, 0.3) * rng.choice([-1, 1])
-        cylinders.append(Cylinder(point, pipe.axis, radius * 1.5, pipe.albedo, pipe.specular, 0, (at - 0.02, at + 0.02)))
+        cylinders.append(
+            Cylinder(point, pipe.axis, radius * 1.5, pipe.albedo, pipe.specular, 0, (at - 0.02, at + 0.02))
+        )
     if rng.random() < 0.3 * difficulty:  # something in front, away from the pick
         at = point + pipe.axis * rng.uniform(0.12, 0.3) * rng.choice([-1, 1]) + np.array([0, 0, -0.25])
-        cylinders.append(Cylinder(at, np.cross(pipe.axis, [0, 0, 1]) + rng.normal(0, 0.3, 3), 0.03, rng.uniform(0.1, 0.9)))
+        cylinders.append(
+            Cylinder(at, np.cross(pipe.axis, [0, 0, 1]) + rng.normal(0, 0.3, 3), 0.03, rng.uniform(0.1, 0.9))
+        )
     kind = rng.choice(["plain", "noise", "brick"])
-    texture = {"plain": lambda: None, "noise": lambda: noise_texture(rng, contrast=rng.uniform(0.2, 0.8)),
-               "brick": lambda: brick_texture(rng)}[kind]()
+    texture = {
+        "plain": lambda: None,
+        "noise": lambda: noise_texture(rng, contrast=rng.uniform(0.2, 0.8)),
+        "brick": lambda: brick_texture(rng),
+    }[kind]()
     light = np.array([rng.uniform(-0.8, 0.8), rng.uniform(-0.9, 0.2), -rng.uniform(0.3, 1)])
-    return Scene(cylinders, z + rng.uniform(0.15, 1.5), tuple(rng.normal(0, 0.2, 2)), texture, rng.uniform(150, 350), tuple(light),
-                 rng.uniform(0.4, 0.9), True, rng.uniform(0.3, 0.8), rng.uniform(1, 4), rng.uniform(110, 180))
+    return Scene(
+        cylinders,
+        z + rng.uniform(0.15, 1.5),
+        tuple(rng.normal(0, 0.2, 2)),
+        texture,
+        rng.uniform(150, 350),
+        tuple(light),
+        rng.uniform(0.4, 0.9),
+        True,
+        rng.uniform(0.3, 0.8),
+        rng.uniform(1, 4),
+        rng.uniform(110, 180),
+    )
 
 
 def pick_on(scene, camera, rng, sigma=1.5):
@@ -226,7 +256,10 @@ def visible_share(scene, camera):
         seen &= (px > 0).all(1) & (px[:, 0] < camera.width) & (px[:, 1] < camera.height)
         if line is not None:  # nothing hides the background beside the edge either
             beside = rays + (line[:2] * 2.5 / camera.fx).tolist() @ np.eye(2, 3)
-            seen &= ~np.any([np.isfinite(hit(c, beside)[0]) & (hit(c, beside)[0] < first) for c in scene.cylinders[1:]]
-                            or [np.zeros(len(px), bool)], axis=0)
+            seen &= ~np.any(
+                [np.isfinite(hit(c, beside)[0]) & (hit(c, beside)[0] < first) for c in scene.cylinders[1:]]
+                or [np.zeros(len(px), bool)],
+                axis=0,
+            )
         shares.append(seen.mean())
     return min(shares)

@@ -65,5 +65,7 @@ _MODELS: dict[str, DepthNoise] = {
     "kinect_v1": DepthNoise(_kinect_v1, lambda z: 2.85e-3 * z**2, 0.35, 5.0, 0.85),
     "kinect_v2": DepthNoise(_kinect_v2, lambda z: np.full_like(z, _MESSAGE_STEP_M), 0.4, 5.0, 0.6),
     "azure": DepthNoise(_kinect_v2, lambda z: np.full_like(z, _MESSAGE_STEP_M), 0.25, 5.5, 0.6),
-    "realsense": DepthNoise(_realsense, lambda z: np.maximum(z**2 / (32 * 640.0 * 0.05), _MESSAGE_STEP_M), 0.2, 6.0, 1.0),
+    "realsense": DepthNoise(
+        _realsense, lambda z: np.maximum(z**2 / (32 * 640.0 * 0.05), _MESSAGE_STEP_M), 0.2, 6.0, 1.0
+    ),
 }

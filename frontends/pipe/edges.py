@@ -126,7 +126,14 @@ def _maxima(score: Float, count: int, closed: bool) -> list[tuple[int, int]]:
 
 
 def _refined(
-    theta: float, distance: int, peak: NDArray[np.bool_], size: Float, first: int, last: int, reach: int, evidence: float
+    theta: float,
+    distance: int,
+    peak: NDArray[np.bool_],
+    size: Float,
+    first: int,
+    last: int,
+    reach: int,
+    evidence: float,
 ) -> EdgeLine | None:
     """Line through the sub-pixel maxima of the stretches of one seed."""
     rows = np.arange(first, last + 1)

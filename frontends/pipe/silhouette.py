@@ -84,7 +84,9 @@ class OutlineFinder:
         config = self._config
         rows, columns = self._window(prior.centre_px)
         if rows.stop - rows.start < 12 or columns.stop - columns.start < 12:
-            return self._refuse(stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0)
+            return self._refuse(
+                stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0
+            )
         grey = image[rows, columns].astype(np.float32)
         noise = image_noise(grey)
         patch, centre = self._ideal_patch(image, prior.centre_px)
@@ -127,7 +129,9 @@ class OutlineFinder:
             return None
         return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
 
-    def _refined(self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float) -> list[_Found]:
+    def _refined(
+        self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float
+    ) -> list[_Found]:
         values, px = grey.ravel(), ideal.reshape(-1, 2)
         fits: dict[tuple[int, bool], EdgeFit | None] = {}
         found = []
@@ -157,7 +161,9 @@ class OutlineFinder:
         score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
         return replace(found, score=found.score + score)
 
-    def _decide(self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior) -> OutlineSighting | Rejection:
+    def _decide(
+        self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior
+    ) -> OutlineSighting | Rejection:
         if not found:
             return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
         config = self._config
@@ -192,7 +198,9 @@ class OutlineFinder:
         lines = np.array([fit.line for fit in best.fits])
         feet = np.array([fit.foot_px for fit in best.fits])
         along = np.column_stack((-lines[:, 1], lines[:, 0]))
-        extent = np.array([[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)])
+        extent = np.array(
+            [[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)]
+        )
         covariance = np.array([fit.covariance for fit in best.fits])
         return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
 

@@ -11,7 +11,9 @@ Float32 = NDArray[np.float32]
 _BIN_PX = 2
 
 
-def occlusion_score(patch: Float32, origin: Float, lines: Float, spans: list[tuple[float, float]], feet: Float) -> float:
+def occlusion_score(
+    patch: Float32, origin: Float, lines: Float, spans: list[tuple[float, float]], feet: Float
+) -> float:
     """Log-likelihood ratio that both edges hide a background, against both lying on one surface.
 
     Args:

@@ -1,0 +1,166 @@
+"""Corner error of the marker front end against rendered truth: bias, scatter and honesty of the covariance.
+
+python benchmarks/corners.py [--images N] [--figure docs/corners.svg] [--json FILE]
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from surecut.factors.camera import CameraModel
+from surecut.factors.rig import Board, Marker, Rig
+from surecut.frontends.fiducials.detector import MarkerFrontEnd
+from surecut.simulation.marker_images import Photography, marker_corners, project, render_board
+
+Float = NDArray[np.float64]
+
+FOCAL_PX = 810.0
+SIDE_M = 0.075
+PAGE_M = (0.2, 0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One row: how large, how oblique, how blurred, how noisy."""
+
+    side_px: float
+    tilt_deg: float
+    blur_px: float
+    noise: float
+    motion_px: float = 0.0
+    dictionary: str = "DICT_4X4_50"
+    white: float = 225.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """Errors over all corners of one condition, pixels; outwards is positive."""
+
+    condition: Condition
+    wanted: int
+    found: int
+    outward: float
+    offset_x: float
+    offset_y: float
+    rms: float
+    sigma: float
+    nees_per_dof: float
+    largest: float
+
+
+def board(dictionary: str) -> Board:
+    places = ((-0.05, -0.05), (0.05, -0.05), (-0.05, 0.05), (0.05, 0.05))
+    markers = tuple(Marker(id=k, centre_m=place) for k, place in enumerate(places))
+    return Board(id="f0", dictionary=dictionary, side_m=SIDE_M, markers=markers)
+
+
+def random_pose(tilt_deg: float, depth_m: float, rng: np.random.Generator) -> Float:
+    """A board in front of the camera, tilted about a random axis in its plane and rolled at random."""
+    about = rng.uniform(0, 2 * np.pi)
+    tilt = cv2.Rodrigues(np.deg2rad(tilt_deg) * np.array([np.cos(about), np.sin(about), 0.0]))[0]
+    roll = cv2.Rodrigues(np.array([0.0, 0.0, rng.uniform(0, 2 * np.pi)]))[0]
+    pose = np.eye(4)
+    pose[:3, :3] = tilt @ np.diag([1.0, -1.0, -1.0]) @ roll
+    pose[:3, 3] = *(rng.uniform(-2, 2, 2) * depth_m / FOCAL_PX), depth_m
+    return pose
+
+
+def camera_for(side_px: float) -> CameraModel:
+    size = int(side_px * 4.4) + 40
+    K = np.array([[FOCAL_PX, 0.0, size / 2 - 0.5], [0.0, FOCAL_PX, size / 2 - 0.5], [0.0, 0.0, 1.0]])
+    return CameraModel("m_left", size, size, K, "none", np.zeros(0), np.eye(3), None)
+
+
+def photograph(
+    condition: Condition, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], dict[int, Float], CameraModel]:
+    """One image, the true corners of its markers, and its camera."""
+    page = board(condition.dictionary)
+    camera = camera_for(condition.side_px)
+    pose = random_pose(condition.tilt_deg, FOCAL_PX * SIDE_M / condition.side_px, rng)
+    about = rng.uniform(0, 2 * np.pi)
+    taken = Photography(
+        blur_px=condition.blur_px,
+        motion_px=(condition.motion_px * np.cos(about), condition.motion_px * np.sin(about)),
+        noise=condition.noise,
+        white=condition.white,
+        shading=(float(rng.uniform(-0.2, 0.2)), float(rng.uniform(-0.2, 0.2))),
+    )
+    image = render_board(page, PAGE_M, camera, pose, taken, rng)
+    return image, {k: project(camera, pose, c) for k, c in marker_corners(page).items()}, camera
+
+
+def measure(condition: Condition, images: int, seed: int) -> Row:
+    """Errors of one condition over some images with random roll, tilt direction, place and light."""
+    rng = np.random.default_rng(seed)
+    errors, outwards, nees, sigmas, wanted = [], [], [], [], 0
+    for _ in range(images):
+        image, truth, camera = photograph(condition, rng)
+        front_end = MarkerFrontEnd(Rig(boards=(board(condition.dictionary),)), camera, "m_left")
+        wanted += len(truth)
+        for sighting in front_end.process(0, image)[0]:
+            true = truth[sighting.marker]
+            error = sighting.corners_px - true
+            away = true - true.mean(0)
+            errors.append(error)
+            outwards.append((error * away).sum(1) / np.linalg.norm(away, axis=1))
+            nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(sighting.covariance_px2), error) / 2)
+            sigmas.append(np.einsum("kii->k", sighting.covariance_px2) / 2)
+    if not errors:
+        return Row(condition, wanted, 0, *([float("nan")] * 7))
+    error = np.stack(errors)
+    return Row(
+        condition,
+        wanted,
+        len(errors),
+        float(np.mean(outwards)),
+        float(error[..., 0].mean()),
+        float(error[..., 1].mean()),
+        float(np.sqrt((error**2).mean())),
+        float(np.sqrt(np.mean(sigmas))),
+        float(np.mean(nees)),
+        float(np.abs(error).max()),
+    )
+
+
+def conditions() -> list[Condition]:
+    result = [
+        Condition(side, tilt, blur, noise)
+        for side in (18, 25, 40, 80, 150)
+        for tilt in (0, 25, 50)
+        for blur, noise in ((0.5, 1.0), (0.8, 2.0), (1.3, 3.0), (2.0, 2.0))
+    ]
+    result += [Condition(side, 20, 0.7, 2.0, motion_px=m) for side in (25, 60) for m in (2.0, 4.0, 6.0)]
+    result += [Condition(side, 20, 0.7, 2.0, white=60.0) for side in (25, 60)]
+    result += [Condition(side, 20, 0.7, 2.0, dictionary=d) for side in (25, 60) for d in ("tag36h11", "DICT_6X6_250")]
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    print("side tilt blur noise motion white dictionary    found  outward      rms    sigma  NEES/dof largest")
+    rows = []
+    for seed, condition in enumerate(conditions()):
+        row = measure(condition, arguments.images, seed)
+        rows.append(row)
+        c = condition
+        print(
+            f"{c.side_px:4.0f} {c.tilt_deg:4.0f} {c.blur_px:4.1f} {c.noise:5.1f} {c.motion_px:6.1f} {c.white:5.0f} "
+            f"{c.dictionary:12s} {row.found:3d}/{row.wanted:3d} {row.outward:+8.4f} "
+            f"{row.rms:8.4f} {row.sigma:8.4f} {row.nees_per_dof:8.2f} {row.largest:8.3f}",
+            flush=True,
+        )
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Does the model agree with its own data? Chi-square by family, and a test of every single prior and tape measure."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+from .batch import residual_norm
+from .graph import FactorLog, Record
+from .linear import DETERMINED, LinearSystem, deviate
+from .result import Consistency, FamilyConsistency
+
+Float = NDArray[np.float64]
+
+FALSE_ALARM = 1e-3
+"""Probability, per family, that a correct model is called inconsistent."""
+SIGMA_TOLERANCE = 0.25
+"""Noise levels are known to a quarter: a family is inconsistent when its residuals need sigmas larger than that."""
+PRIOR_FALSE_ALARM = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class PriorTest:
+    """How far one prior, distance or mount lies from what everything else says, in its own predicted spread."""
+
+    record: Record
+    chi2: float
+    dof: int
+    sigma: float
+    """The normal deviate that is as improbable."""
+    residual: Float
+    """Whitened residual."""
+
+
+def family_tests(
+    log: FactorLog,
+    active: list[tuple[int, gtsam.NonlinearFactor, Record]],
+    system: LinearSystem,
+    values: gtsam.Values,
+    robust_sigma: float,
+) -> tuple[FamilyConsistency, ...]:
+    """Chi-square of every family of measurements that has degrees of freedom to spare."""
+    families = sorted({r.family for _, _, r in active})
+    group = np.array([families.index(r.family) for _, _, r in active])
+    shares = system.leverage(group, len(families))
+    tests = []
+    for g, family in enumerate(families):
+        members = [(f, r) for _, f, r in active if r.family == family]
+        norms = np.array([residual_norm(f, values, robust_sigma, r.rejectable) for f, r in members])
+        rows = int(system.rows[group == g].sum())
+        dof = max(rows - float(shares[g]), 0.0)
+        soft = int(sum(n > 3.0 * np.sqrt(f.dim()) for n, (f, _) in zip(norms, members, strict=True)))
+        total = float((norms**2).sum())
+        lower, upper = limits(dof)
+        tests.append(FamilyConsistency(family, total, dof, lower, upper, len(members), soft))
+    return tuple(tests)
+
+
+def limits(dof: float) -> tuple[float, float]:
+    """Acceptance limits of chi2 / dof: what chance and a quarter of uncertainty in sigma allow."""
+    if dof < 1.0:
+        return 0.0, float("inf")
+    lower = float(chi2.ppf(FALSE_ALARM / 2, dof)) / dof / (1 + SIGMA_TOLERANCE) ** 2
+    upper = float(chi2.ppf(1 - FALSE_ALARM / 2, dof)) / dof * (1 + SIGMA_TOLERANCE) ** 2
+    return lower, upper
+
+
+def prior_tests(
+    active: list[tuple[int, gtsam.NonlinearFactor, Record]], system: LinearSystem, families: tuple[str, ...]
+) -> list[PriorTest]:
+    """Each prior against the rest: its residual has covariance I - H, H its block of the hat matrix."""
+    tests = []
+    for position, (_, _, record) in enumerate(active):
+        if record.rejectable or record.family not in families:
+            continue
+        rows = slice(system.starts[position], system.starts[position + 1])
+        A = system.A[rows].toarray()
+        hat = A @ system.solve(A.T)
+        spread = np.eye(A.shape[0]) - 0.5 * (hat + hat.T)
+        eigenvalues, vectors = np.linalg.eigh(spread)
+        free = eigenvalues > DETERMINED
+        if not free.any():
+            continue
+        residual = -system.b[rows]
+        along = (vectors.T @ residual)[free]
+        total = float((along**2 / eigenvalues[free]).sum())
+        dof = int(free.sum())
+        tests.append(PriorTest(record, total, dof, deviate(total, dof), residual))
+    return tests
+
+
+def judge(families: tuple[FamilyConsistency, ...], priors: list[PriorTest], paths: dict[str, float]) -> Consistency:
+    """The verdict with its reasons."""
+    reasons = []
+    for f in families:
+        if f.dof >= 1.0 and f.chi2 / f.dof > f.upper:
+            factor = np.sqrt(f.chi2 / f.dof)
+            reasons.append(
+                f"{f.family}: residuals are {factor:.2f} times what their sigmas say (limit {np.sqrt(f.upper):.2f})"
+            )
+    limit = float(norm.isf(PRIOR_FALSE_ALARM / 2))
+    for test in priors:
+        if test.sigma > limit:
+            reasons.append(
+                f"{test.record.what}: {test.sigma:.1f} sigma from what everything else says (limit {limit:.1f})"
+            )
+    measured = [f for f in families if f.family not in ("gauge", "calibration priors", "mount", "board geometry")]
+    return Consistency(
+        float(sum(f.chi2 for f in measured)),
+        float(sum(f.dof for f in measured)),
+        families,
+        paths,
+        not reasons,
+        tuple(reasons),
+    )

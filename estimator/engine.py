@@ -1,0 +1,381 @@
+"""The joint estimator: measurements in, in the order of their time; an estimate at any moment.
+
+One engine serves offline and streaming. `add` takes all measurements of one stamp and does one iSAM2 update when they
+hold something for the graph.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors import keys
+from ..factors.board import distance_factor
+from ..factors.calibration import (
+    cal3,
+    depth_prior,
+    intrinsics_prior,
+    left_T_right,
+    rgb_mean,
+    rgb_prior,
+    stereo_prior,
+)
+from ..factors.camera import CameraModel
+from ..factors.geometry import pose3
+from ..factors.links import gauge_prior, mount_factor, mount_pose
+from ..factors.measurements import CloudFrame, Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
+from ..factors.noise import sigmas
+from ..factors.rig import Rig
+from ..frontends.resection import camera_pose
+from .boards import DISTANCES, Boards
+from .graph import Record, State, Update
+from .incremental import Incremental
+from .marker_points import MarkerPoint, parse_point
+from .odometry import FramePose, Odometry, OdometrySettings
+from .pipes import Pipes, SeenFrom
+from .surfaces import Associator, Surfaces, SurfaceSettings
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """All measurements of one stamp."""
+
+    stamp_ns: int
+    frame: StereoFrame | None = None
+    sightings: tuple[MarkerSighting, ...] = ()
+    picks: tuple[Pick, ...] = ()
+    depths_m: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Surface depth and its sigma under the picks of this stamp, by point id, where it could be measured."""
+    outlines: tuple[OutlineSighting, ...] = ()
+    cloud: CloudFrame | None = None
+
+
+class Engine:
+    """Graph, iSAM2 and the sensors' book-keeping of one run."""
+
+    def __init__(self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator) -> None:
+        self.rig = rig
+        self.cameras = dict(cameras)
+        self.state = State()
+        self.solver = Incremental()
+        sigma = rig.gates.robust_sigma
+        self.odometry = Odometry(self.state, OdometrySettings(), sigma)
+        self.boards = Boards(rig, self.state)
+        self.pipes = Pipes(rig, self.state)
+        self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
+        self.events: list[Event] = []
+        self.rejected: list[Rejection] = []
+        self.keyframe_at: dict[int, int] = {}
+        """Stamp to keyframe index."""
+        self._recent: dict[int, tuple[StereoFrame, int, Float]] = {}
+        self._distances_open = list(rig.distances)
+        self._waiting: list[Bundle] = []
+        self._forced = False
+        self._pending = Update()
+        self.end_ns = 0
+
+    # The loop -------------------------------------------------------------------------------------------------
+
+    def add(self, bundle: Bundle) -> bool:
+        """Takes one stamp's measurements; True when the estimate has changed."""
+        self.end_ns = max(self.end_ns, bundle.stamp_ns)
+        self._open_calibration(bundle)
+        if bundle.frame is not None:
+            self._follow(bundle.frame)
+        if self._wants_keyframe(bundle):
+            self._insert_keyframe(bundle)
+        if bundle.cloud is not None:
+            self.surfaces.see(bundle.cloud)
+        for pick in bundle.picks:
+            self._pick(pick, bundle.depths_m.get(pick.point_id))
+        for outline in bundle.outlines:
+            self.add_outline(outline)
+        return self.flush()
+
+    def flush(self) -> bool:
+        """One iSAM2 update with what has gathered."""
+        if self._pending.empty():
+            return False
+        update, self._pending = self._pending, Update()
+        self.state.values = self.solver.update(update)
+        return True
+
+    def _take(self, update: Update) -> None:
+        """New factors wait for the next update; their guesses count from now on."""
+        if update.empty():
+            return
+        self.state.values.insert(update.values)
+        self._pending.extend(update)
+
+    # Calibration ----------------------------------------------------------------------------------------------
+
+    def _open_calibration(self, bundle: Bundle) -> None:
+        """Calibration states enter with their priors when their camera first delivers something."""
+        used = {s.camera for s in bundle.sightings} | {p.camera for p in bundle.picks}
+        if bundle.frame is not None:
+            used |= {"m_left", "m_right"}
+        if used & {"m_right"}:
+            used.add("m_left")
+        for camera in sorted(used):
+            if camera in keys.CAMERA_INDEX and not self.state.has(keys.intrinsics(camera)):
+                self._open_camera(camera, bundle.stamp_ns)
+        if bundle.cloud is not None and not self.state.has(keys.DEPTH):
+            update = Update()
+            update.guess(keys.DEPTH, np.zeros(2))
+            update.add(depth_prior(self.rig.kinect), _prior("Kinect depth", bundle.stamp_ns))
+            self._take(update)
+
+    def _open_camera(self, camera: str, stamp_ns: int) -> None:
+        update = Update()
+        model = self.cameras[camera]
+        update.guess(keys.intrinsics(camera), cal3(model))
+        update.add(
+            intrinsics_prior(camera, model, getattr(self.rig.cameras, camera)), _prior(f"intrinsics {camera}", stamp_ns)
+        )
+        if camera == "m_right":
+            mean = left_T_right(self.cameras["m_left"], model, self.rig.stereo)
+            update.guess(keys.extrinsics(camera), mean)
+            update.add(stereo_prior(mean, self.rig.stereo), _prior("m_left_T_m_right", stamp_ns))
+        if camera == "b_rgb":
+            update.guess(keys.extrinsics(camera), rgb_mean(self.rig.kinect))
+            update.add(rgb_prior(self.rig.kinect), _prior("b_T_rgb", stamp_ns))
+        self._take(update)
+
+    # Keyframes ------------------------------------------------------------------------------------------------
+
+    def _follow(self, frame: StereoFrame) -> None:
+        self.odometry.follow(frame)
+
+    def _wants_keyframe(self, bundle: Bundle) -> bool:
+        mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
+        if bundle.frame is None:
+            return bool(mobile)
+        first = not self.odometry.keyframe_stamps
+        picked = any(p.stamp_ns == bundle.stamp_ns and p.camera != "b_rgb" for p in bundle.picks)
+        return first or bundle.frame.is_keyframe or picked
+
+    def _insert_keyframe(self, bundle: Bundle) -> None:
+        if bundle.frame is not None:
+            index = self.odometry.last_keyframe + 1
+            update, rejected = self.odometry.insert(bundle.frame)
+            self.rejected += rejected
+            self._take(update)
+        else:
+            placed = self._place_by_markers(bundle)
+            if placed is None:
+                return
+            index = placed
+        self.keyframe_at[bundle.stamp_ns] = index
+        self._see_boards(keys.keyframe(index), bundle)
+        self._open_base(bundle.stamp_ns)
+        self._close_distances(bundle.stamp_ns)
+        self.flush()
+        self._lay_landmarks(index)
+
+    def _see_boards(self, key: int, bundle: Bundle) -> None:
+        mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
+        if mobile:
+            self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced))
+
+    def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
+        o_T_m = self.state.pose(key)
+        poses = {"m_left": o_T_m}
+        if self.state.has(keys.extrinsics("m_right")):
+            poses["m_right"] = o_T_m.compose(self.state.pose(keys.extrinsics("m_right")))
+        return poses
+
+    def _place_by_markers(self, bundle: Bundle) -> int | None:
+        """A keyframe without tracks stands where the known boards put it; else it waits for one of them."""
+        index = len(self.odometry.keyframe_stamps)
+        if index == 0:
+            found = gtsam.Pose3() if self._forced or self.boards.can_start(bundle.sightings) else None
+        else:
+            found = self._resect(bundle)
+        if found is None:
+            self._waiting.append(bundle)
+            return None
+        pose = found
+        update = Update()
+        key = keys.keyframe(index)
+        update.guess(key, pose)
+        if index == 0:
+            update.add(gauge_prior(key), Record("gauge", "gauge", bundle.stamp_ns, "origin {o}", rejectable=False))
+        self.odometry.keyframe_stamps.append(bundle.stamp_ns)
+        self.odometry.frames.append(FramePose(bundle.stamp_ns, index, np.eye(4)))
+        self._take(update)
+        return index
+
+    def _resect(self, bundle: Bundle) -> gtsam.Pose3 | None:
+        """`o_T_m` from the corners of known boards in one of the mobile cameras."""
+        for camera in ("m_left", "m_right"):
+            seen = [s for s in bundle.sightings if s.camera == camera]
+            points, px = self.boards.known_corners(seen)
+            if len(points) < 4:
+                continue
+            guess = None
+            if len(points) < 8:
+                last = self.state.pose(keys.keyframe(self.odometry.last_keyframe))
+                guess = (last if camera == "m_left" else self._camera_poses_at(last)["m_right"]).matrix()
+            found = camera_pose(points, px, self.state.intrinsics(keys.intrinsics(camera)).K(), guess)
+            if found is None or found[1] > 5.0:
+                continue
+            pose = pose3(found[0])
+            if camera == "m_right":
+                pose = pose.compose(self.state.pose(keys.extrinsics("m_right")).inverse())
+            return pose
+        return None
+
+    def _camera_poses_at(self, o_T_m: gtsam.Pose3) -> dict[str, gtsam.Pose3]:
+        return {"m_left": o_T_m, "m_right": o_T_m.compose(self.state.pose(keys.extrinsics("m_right")))}
+
+    def revisit(self) -> None:
+        """Frames that saw no known board get another chance, as long as that makes more boards known."""
+        if self._waiting and not self.odometry.keyframe_stamps:
+            self._start_from_best()
+        while self._waiting:
+            before = len(self._waiting)
+            waiting, self._waiting = self._waiting, []
+            for bundle in waiting:
+                self._insert_keyframe(bundle)
+                self.flush()
+            if len(self._waiting) == before:
+                break
+
+    def _start_from_best(self) -> None:
+        """No frame is free of doubt: the one with the least begins."""
+        best = max(self._waiting, key=lambda b: max((self.boards.margin([s]) for s in b.sightings), default=-1.0))
+        self._waiting.remove(best)
+        self._forced = True
+        self._insert_keyframe(best)
+        self._forced = False
+        self.flush()
+
+    # The machine ----------------------------------------------------------------------------------------------
+
+    def _open_base(self, stamp_ns: int) -> None:
+        """{b} enters through the mount when its board is known."""
+        mount = self.rig.mount
+        base = keys.base(0)
+        if mount is None or self.state.has(base) or not self.boards.known(mount.board):
+            return
+        board = self.boards.key(mount.board)
+        update = Update()
+        update.guess(base, self.state.pose(board).compose(mount_pose(mount)))
+        what = f"f_T_b of board {mount.board}"
+        update.add(mount_factor(mount, board, base), Record("mount", "mount", stamp_ns, what, rejectable=False))
+        self._take(update)
+
+    def _close_distances(self, stamp_ns: int) -> None:
+        """Known distances enter when both of their points are in the graph."""
+        still = []
+        for distance in self._distances_open:
+            a, b = (self.point_keys(parse_point(text, self.rig)) for text in (distance.point_a, distance.point_b))
+            if a is None or b is None:
+                still.append(distance)
+                continue
+            update = Update()
+            factor = distance_factor(a, b, distance.distance_m, sigmas([distance.sigma_m]))
+            what = f"distance {distance.point_a} to {distance.point_b}"
+            update.add(factor, Record(DISTANCES, what, stamp_ns, what, rejectable=False))
+            self._take(update)
+        self._distances_open = still
+
+    def point_keys(self, point: MarkerPoint) -> list[int] | None:
+        """Keys of the corners whose mean a marker point is, None while it has not been seen."""
+        slot = self.boards.slot_of(point.board, point.marker)
+        if slot is None or not self.state.has(keys.corner(slot, 0)):
+            return None
+        corners = range(4) if point.corner is None else [point.corner]
+        return [keys.corner(slot, i) for i in corners]
+
+    def _lay_landmarks(self, index: int) -> None:
+        if self.state.has(keys.base(0)) and self.state.has(keys.DEPTH):
+            camera = self.state.pose(keys.keyframe(index))
+            self._take(self.surfaces.lay(keys.base(0), camera, self.odometry.observations))
+
+    # Picks and pipes ------------------------------------------------------------------------------------------
+
+    def seen_from(self, camera: str, stamp_ns: int) -> SeenFrom | None:
+        """The pose that a camera's pixels at a stamp hang on, None when there is no keyframe."""
+        if camera == "b_rgb":
+            if not self.state.has(keys.base(0)):
+                return None
+            pose = self.state.pose(keys.base(0)).compose(self.state.pose(keys.extrinsics("b_rgb")))
+            return SeenFrom(keys.base(0), pose)
+        index = self.keyframe_at.get(stamp_ns)
+        if index is None:
+            return None
+        return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
+
+    def _pick(self, pick: Pick, depth_m: tuple[float, float] | None) -> None:
+        where = self.seen_from(pick.camera, pick.stamp_ns)
+        if where is None:
+            self.rejected.append(
+                Rejection(pick.stamp_ns, "picks", f"pick {pick.point_id}", "no frame of its stamp; frames", 0.0, 1.0)
+            )
+            return
+        self._take(self.pipes.pick(pick, where, depth_m))
+
+    def add_outline(self, outline: OutlineSighting) -> None:
+        """Edges of a pipe in a keyframe's image; enters with the next update."""
+        where = self.seen_from(outline.camera, outline.stamp_ns)
+        if where is not None:
+            self._take(self.pipes.outline(outline, where))
+
+    def everything_rejected(self) -> list[Rejection]:
+        """All measurements that did not enter, with reasons."""
+        waiting = [
+            Rejection(
+                b.stamp_ns,
+                "marker corners",
+                f"{len(b.sightings)} markers of a frame",
+                "no known board; boards",
+                0.0,
+                1.0,
+            )
+            for b in self._waiting
+        ]
+        return [
+            *self.rejected,
+            *self.boards.rejected,
+            *self.boards.held_back(),
+            *self.pipes.rejected,
+            *self.pipes.held_back(),
+            *self.surfaces.refused.values(),
+            *waiting,
+        ]
+
+    def everything_told(self) -> list[Event]:
+        return [*self.events, *self.boards.events]
+
+
+def _prior(name: str, stamp_ns: int) -> Record:
+    return Record("calibration priors", name, stamp_ns, f"prior of {name}", rejectable=False)
+
+
+def bundles(measurements: Sequence[object]) -> list[Bundle]:
+    """Groups measurements of one stamp; they come out in the order of their stamps."""
+    groups: dict[int, list[object]] = {}
+    for m in measurements:
+        groups.setdefault(m.stamp_ns, []).append(m)  # type: ignore[attr-defined]
+    return [_bundle(stamp, group) for stamp, group in sorted(groups.items())]
+
+
+def _bundle(stamp_ns: int, group: list[object]) -> Bundle:
+    def of(kind: type) -> tuple:
+        return tuple(m for m in group if isinstance(m, kind))
+
+    frames, clouds = of(StereoFrame), of(CloudFrame)
+    return Bundle(
+        stamp_ns,
+        frames[0] if frames else None,
+        of(MarkerSighting),
+        of(Pick),
+        {},
+        of(OutlineSighting),
+        clouds[0] if clouds else None,
+    )

@@ -1,0 +1,95 @@
+"""The currency between sensors and solvers: factors with their provenance, and first guesses of new variables."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Where a factor comes from."""
+
+    family: str
+    """`marker corners`, `board geometry`, `known distances`, `stereo odometry`, `depth cloud`, `pipe outline`,
+    `picks`, `mount`, `calibration priors`, `gauge`."""
+    source: str
+    """Finer than the family: the camera, the board, or the calibration state whose prior it is."""
+    stamp_ns: int
+    what: str
+    """The measurement in words."""
+    rejectable: bool = True
+    """False for priors and definitions, which are never thrown out as outliers."""
+    camera: str | None = None
+
+
+@dataclass(slots=True)
+class Update:
+    """Factors and guesses that belong together: they enter the graph in one step."""
+
+    factors: list[gtsam.NonlinearFactor] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+
+    def add(self, factor: gtsam.NonlinearFactor, record: Record) -> None:
+        self.factors.append(factor)
+        self.records.append(record)
+
+    def guess(self, key: int, value: Any) -> None:
+        self.values.insert(key, value)
+
+    def extend(self, other: "Update") -> None:
+        self.factors.extend(other.factors)
+        self.records.extend(other.records)
+        self.values.insert(other.values)
+
+    def empty(self) -> bool:
+        return not self.factors and self.values.size() == 0
+
+
+class State:
+    """What is believed now: the latest estimate and the guesses that have not been through the solver yet."""
+
+    def __init__(self) -> None:
+        self.values = gtsam.Values()
+
+    def has(self, key: int) -> bool:
+        return self.values.exists(key)
+
+    def pose(self, key: int) -> gtsam.Pose3:
+        return self.values.atPose3(key)
+
+    def point(self, key: int) -> np.ndarray:
+        return self.values.atPoint3(key)
+
+    def vector(self, key: int) -> np.ndarray:
+        return self.values.atVector(key)
+
+    def intrinsics(self, key: int) -> gtsam.Cal3DS2:
+        return self.values.atCal3DS2(key)
+
+
+class FactorLog:
+    """All factors ever added, in order, with the ones that are switched off."""
+
+    def __init__(self) -> None:
+        self.factors: list[gtsam.NonlinearFactor] = []
+        self.records: list[Record] = []
+        self.off: set[int] = set()
+
+    def append(self, update: Update) -> None:
+        self.factors.extend(update.factors)
+        self.records.extend(update.records)
+
+    def active(self) -> Iterator[tuple[int, gtsam.NonlinearFactor, Record]]:
+        for index, (factor, record) in enumerate(zip(self.factors, self.records, strict=True)):
+            if index not in self.off:
+                yield index, factor, record
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor, _ in self.active():
+            graph.add(factor)
+        return graph

@@ -1,0 +1,239 @@
+"""Stereo visual odometry in the graph: keyframes, and the landmarks that tie them together."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors import keys
+from ..factors.geometry import pose3
+from ..factors.links import gauge_prior, motion_prior
+from ..factors.measurements import Rejection, StereoFrame
+from ..factors.noise import gaussian, robust
+from ..factors.projection import mobile_projection
+from .graph import Record, State, Update
+
+Float = NDArray[np.float64]
+
+FAMILY = "stereo odometry"
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySettings:
+    """How many tracks enter, and what counts as a landmark."""
+
+    tracks_per_keyframe: int = 90
+    minimum_disparity_px: float = 1.0
+    """Below it a point is too far for a first guess from stereo."""
+    gate_sigma: float = 6.0
+    gate_px: float = 2.0
+    """A track off by more than both of these from where the map says is not that landmark any more."""
+    minimum_shared: int = 12
+    """Fewer landmarks shared with the map: a motion prior joins the keyframe to the last one."""
+    lost_speed_m_s: float = 0.5
+    lost_turn_rad_s: float = 1.0
+    """Standard deviation of a hand-held camera's velocity about its last one, while nothing is tracked."""
+
+
+@dataclass(frozen=True, slots=True)
+class FramePose:
+    """A frame's place relative to its keyframe; the trajectory is made of these at the end."""
+
+    stamp_ns: int
+    keyframe: int
+    """Index of the keyframe."""
+    keyframe_T_this: Float
+    """Shape (4, 4)."""
+
+
+class Odometry:
+    """Turns stereo frames into keyframes and landmarks."""
+
+    def __init__(self, state: State, settings: OdometrySettings, robust_sigma: float) -> None:
+        self._state = state
+        self._settings = settings
+        self._robust_sigma = robust_sigma
+        self._waiting: dict[int, tuple[int, StereoFrame, int]] = {}
+        self.keyframe_stamps: list[int] = []
+        self.frames: list[FramePose] = []
+        self.observations: dict[int, int] = {}
+        """Number of keyframes in which each landmark was seen."""
+        self._keyframe_T_last = np.eye(4)
+        self._since_keyframe_lost = False
+
+    @property
+    def last_keyframe(self) -> int:
+        """Index of the newest keyframe, -1 before the first."""
+        return len(self.keyframe_stamps) - 1
+
+    def follow(self, frame: StereoFrame) -> None:
+        """Moves the camera by the front end's estimate; every frame passes here once, in order."""
+        if self.keyframe_stamps:
+            self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
+            self._since_keyframe_lost |= frame.lost
+            self.frames.append(FramePose(frame.stamp_ns, self.last_keyframe, self._keyframe_T_last))
+
+    def insert(self, frame: StereoFrame) -> tuple[Update, list[Rejection]]:
+        """Makes the frame just followed a keyframe."""
+        update = Update()
+        index = len(self.keyframe_stamps)
+        pose = self._guess_pose(frame, index)
+        key = keys.keyframe(index)
+        update.guess(key, pose)
+        rejected: list[Rejection] = []
+        known, new = self._split(frame)
+        if index == 0:
+            update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
+        else:
+            known, rejected = self._gated(frame, known, pose)
+            if self._since_keyframe_lost or len(known) < self._settings.minimum_shared:
+                self._bridge(update, index, frame, pose)
+        for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
+            self._observe(update, frame, row, index)
+        self._create(update, frame, new, index, pose)
+        self.keyframe_stamps.append(frame.stamp_ns)
+        self._keyframe_T_last = np.eye(4)
+        self._since_keyframe_lost = False
+        self.frames = [f for f in self.frames if f.stamp_ns != frame.stamp_ns]
+        self.frames.append(FramePose(frame.stamp_ns, index, np.eye(4)))
+        return update, rejected
+
+    def _guess_pose(self, frame: StereoFrame, index: int) -> gtsam.Pose3:
+        if index == 0:
+            return gtsam.Pose3()
+        previous = self._state.pose(keys.keyframe(index - 1))
+        return previous.compose(pose3(self._keyframe_T_last))
+
+    def _split(self, frame: StereoFrame) -> tuple[list[int], list[int]]:
+        """Rows of tracks that are landmarks already, and rows that may become ones."""
+        known, new = [], []
+        for row, track in enumerate(frame.track_ids):
+            if self._state.has(keys.landmark(int(track))):
+                known.append(row)
+            elif np.isfinite(frame.right_px[row, 0]):
+                new.append(row)
+        return known, new
+
+    def _gated(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[list[int], list[Rejection]]:
+        """Leaves out tracks that are far from where the map and the common shift of all tracks put them."""
+        if not rows:
+            return rows, []
+        points = np.array([self._state.point(keys.landmark(int(frame.track_ids[r]))) for r in rows])
+        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
+        c_p = (points - pose.translation()) @ pose.rotation().matrix()
+        front = c_p[:, 2] > 0.05
+        px = (c_p @ K.T)[:, :2] / np.where(front, c_p[:, 2], 1.0)[:, None]
+        residual = frame.left_px[rows] - px
+        shift = np.median(residual[front], axis=0) if front.any() else np.zeros(2)
+        residual = residual - shift
+        distance = np.linalg.norm(residual, axis=1)
+        spread = np.maximum(1.4826 * float(np.median(distance)), 0.0)
+        sigma = np.sqrt(np.trace(frame.left_covariance_px2[rows], axis1=1, axis2=2) / 2)
+        limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
+        good = front & (distance < limit)
+        rejected = [
+            Rejection(
+                frame.stamp_ns,
+                FAMILY,
+                f"track {int(frame.track_ids[r])} in m_left",
+                "off its landmark by px",
+                float(distance[i]),
+                float(limit[i]),
+            )
+            for i, r in enumerate(rows)
+            if not good[i]
+        ]
+        return [r for i, r in enumerate(rows) if good[i]], rejected
+
+    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
+        """Joins a keyframe that the map does not hold by a motion prior."""
+        earlier = keys.keyframe(index - 1)
+        seconds = (frame.stamp_ns - self.keyframe_stamps[-1]) * 1e-9
+        motion = self._state.pose(earlier).between(pose)
+        factor = motion_prior(
+            earlier,
+            keys.keyframe(index),
+            motion,
+            abs(seconds),
+            self._settings.lost_speed_m_s,
+            self._settings.lost_turn_rad_s,
+        )
+        what = f"motion over {seconds:.2f} s without enough shared landmarks"
+        update.add(factor, Record(FAMILY, "motion prior", frame.stamp_ns, what, rejectable=False))
+
+    def _observe(self, update: Update, frame: StereoFrame, row: int, index: int) -> None:
+        """Adds one track's pixels, left and (where found) right."""
+        track = int(frame.track_ids[row])
+        pose, point = keys.keyframe(index), keys.landmark(track)
+        views = [("m_left", frame.left_px[row], frame.left_covariance_px2[row])]
+        if np.isfinite(frame.right_px[row, 0]):
+            views.append(("m_right", frame.right_px[row], frame.right_covariance_px2[row]))
+        for camera, px, covariance in views:
+            model = robust(gaussian(covariance), self._robust_sigma)
+            record = Record(FAMILY, f"tracks {camera}", frame.stamp_ns, f"track {track} in {camera}", camera=camera)
+            update.add(mobile_projection(camera, px, model, pose, point), record)
+        self.observations[track] = self.observations.get(track, 0) + 1
+
+    def _create(self, update: Update, frame: StereoFrame, rows: list[int], index: int, pose: gtsam.Pose3) -> None:
+        """New landmarks from tracks seen in an earlier keyframe too; others wait for their second one."""
+        room = self._settings.tracks_per_keyframe
+        ready = [r for r in rows if int(frame.track_ids[r]) in self._waiting]
+        ready = _spread(frame.left_px, ready, room)
+        points = self._triangulate(frame, ready)
+        for r, c_p in zip(ready, points, strict=True):
+            if c_p is None:
+                continue
+            track = int(frame.track_ids[r])
+            first_index, first_frame, first_row = self._waiting.pop(track)
+            update.guess(keys.landmark(track), pose.transformFrom(c_p))
+            self._observe(update, first_frame, first_row, first_index)
+            self._observe(update, frame, r, index)
+        for r in rows:
+            track = int(frame.track_ids[r])
+            if not update.values.exists(keys.landmark(track)):
+                self._waiting[track] = (index, frame, r)
+        alive = {int(t) for t in frame.track_ids}
+        self._waiting = {t: w for t, w in self._waiting.items() if t in alive or index - w[0] < 3}
+
+    def _triangulate(self, frame: StereoFrame, rows: list[int]) -> list[Float | None]:
+        """Points in the left camera by the current calibration (linear, two rays), None where too far or behind."""
+        if not rows:
+            return []
+        K_left = self._state.intrinsics(keys.intrinsics("m_left")).K()
+        K_right = self._state.intrinsics(keys.intrinsics("m_right")).K()
+        l_T_r = self._state.pose(keys.extrinsics("m_right"))
+        a = _rays(frame.left_px[rows], K_left)
+        b = _rays(frame.right_px[rows], K_right) @ l_T_r.rotation().matrix().T
+        t = l_T_r.translation()
+        # a * s - b * u = t, least squares in closed form
+        aa, bb, ab = (a * a).sum(1), (b * b).sum(1), (a * b).sum(1)
+        at, bt = a @ t, b @ t
+        det = aa * bb - ab * ab
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = (bb * at - ab * bt) / det
+        disparity = np.linalg.norm(t) * K_left[0, 0] / np.where(s > 0, s, np.inf)
+        good = np.isfinite(s) & (s > 0.05) & (disparity > self._settings.minimum_disparity_px)
+        return [a[i] * s[i] if good[i] else None for i in range(len(rows))]
+
+
+def _rays(px: Float, K: Float) -> Float:
+    """Directions with z = 1, shape (n, 3)."""
+    return np.stack([(px[:, 0] - K[0, 2]) / K[0, 0], (px[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(px))], axis=1)
+
+
+def _spread(px: Float, rows: list[int], count: int) -> list[int]:
+    """At most `count` rows, taken round robin from the cells of a coarse grid, so that they cover the image."""
+    if len(rows) <= count:
+        return rows
+    cell = 1 + np.ptp(px[rows], axis=0) / 6
+    bins: dict[tuple[int, int], list[int]] = {}
+    for r in rows:
+        u, v = (px[r] // cell).astype(int)
+        bins.setdefault((int(u), int(v)), []).append(r)
+    chosen: list[int] = []
+    while len(chosen) < count:
+        for members in bins.values():
+            if members and len(chosen) < count:
+                chosen.append(members.pop(0))
+    return chosen

@@ -1,0 +1,323 @@
+"""Picks become points, outlines become pipes: what the operator named, in {o}."""
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors import keys
+from ..factors.measurements import OutlineSighting, Pick, Rejection
+from ..factors.noise import gaussian, robust, sigmas
+from ..factors.pipe import axis_gauge, line_planes, on_axis_factor, outline_factor, radius_prior, tangency_covariance
+from ..factors.projection import depth_factor, machine_projection, mobile_projection
+from ..factors.rig import Pipe, Rig
+from .graph import Record, State, Update
+
+Float = NDArray[np.float64]
+
+FAMILY = "picks"
+OUTLINE = "pipe outline"
+AXIS_ROLES = ("cut", "grasp")
+MINIMUM_PARALLAX_RAD = 0.03
+"""Below it two rays do not place a point well enough to start from."""
+WIDE_RADIUS_M = (0.05, 0.04)
+"""Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
+GAUGE_HALF_LENGTH_M = 0.25
+EDGE_FLOOR_PX = 0.08
+"""Blur and shading move an edge by about this much from its place, the same for all pixels of one view."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFrom:
+    """A pose that a camera hangs on: the key in the graph, and where the camera is believed to be."""
+
+    key: int
+    o_T_c: gtsam.Pose3
+
+
+@dataclass(slots=True)
+class _Point:
+    index: int
+    id: str
+    role: str
+    pipe: str | None
+    held: list[tuple[SeenFrom, Pick]] = field(default_factory=list)
+    known: bool = False
+    on_axis: bool = False
+    picks: int = 0
+    stamp_ns: int = 0
+
+
+@dataclass(slots=True)
+class _Cylinder:
+    index: int
+    pipe: Pipe
+    known: bool = False
+    held: list[tuple[SeenFrom, OutlineSighting]] = field(default_factory=list)
+    outlines: int = 0
+
+
+class Pipes:
+    """All pipe points and pipes of one run."""
+
+    def __init__(self, rig: Rig, state: State) -> None:
+        self._rig = rig
+        self._state = state
+        self.points: dict[str, _Point] = {}
+        self.cylinders: dict[str, _Cylinder] = {p.id: _Cylinder(i, p) for i, p in enumerate(rig.pipes)}
+        self.rejected: list[Rejection] = []
+
+    def pipe_of(self, point_id: str) -> str:
+        """The pipe that a point is on."""
+        for pipe in self._rig.pipes:
+            if point_id in pipe.points or not pipe.points:
+                return pipe.id
+        return "pipe0"
+
+    def pick(self, pick: Pick, seen_from: SeenFrom, depth_m: tuple[float, float] | None) -> Update:
+        """A click. `depth_m` is the depth of the surface under it and its sigma, where it could be measured."""
+        point = self._point(pick)
+        point.held.append((seen_from, pick))
+        update = Update()
+        if not point.known:
+            start = self._start(point, depth_m)
+            if start is None:
+                return update
+            update.guess(keys.point(point.index), start)
+            point.known = True
+        for where, held in point.held:
+            self._observe(point, where, held, update)
+        point.held.clear()
+        if depth_m is not None and pick.camera == "m_left":
+            self._observe_depth(point, seen_from, pick, depth_m, update)
+        self._attach(point, update)
+        return update
+
+    def _point(self, pick: Pick) -> _Point:
+        if pick.point_id not in self.points:
+            pipe = self.pipe_of(pick.point_id) if pick.role in AXIS_ROLES else None
+            self.points[pick.point_id] = _Point(len(self.points), pick.point_id, pick.role, pipe)
+        return self.points[pick.point_id]
+
+    def _start(self, point: _Point, depth_m: tuple[float, float] | None) -> Float | None:
+        """Where the point begins: from two rays with parallax, or from a measured depth."""
+        rays = [self._ray(where, pick.camera, pick.px) for where, pick in point.held]
+        place = _intersection(rays)
+        if place is not None:
+            return place
+        if depth_m is None:
+            return None
+        origin, direction = rays[-1]
+        radius = WIDE_RADIUS_M[0] if point.role in AXIS_ROLES else 0.0
+        forward = point.held[-1][0].o_T_c.rotation().matrix()[:, 2]
+        return origin + direction * ((depth_m[0] + radius) / float(direction @ forward))
+
+    def _ray(self, where: SeenFrom, camera: str, px: Float) -> tuple[Float, Float]:
+        K = self._state.intrinsics(keys.intrinsics(camera)).K()
+        direction = where.o_T_c.rotation().matrix() @ np.linalg.solve(K, np.array([px[0], px[1], 1.0]))
+        return where.o_T_c.translation(), direction / np.linalg.norm(direction)
+
+    def _observe(self, point: _Point, where: SeenFrom, pick: Pick, update: Update) -> None:
+        covariance = pick.covariance_px2 + np.eye(2) * self._rig.noise.pick_floor_px**2
+        model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
+        key = keys.point(point.index)
+        if pick.camera == "b_rgb":
+            factor = machine_projection(pick.px, model, where.key, key)
+        else:
+            factor = mobile_projection(pick.camera, pick.px, model, where.key, key)
+        what = f"pick {pick.point_id} in {pick.camera}"
+        update.add(factor, Record(FAMILY, f"picks {pick.point_id}", pick.stamp_ns, what, camera=pick.camera))
+        point.picks += 1
+        point.stamp_ns = max(point.stamp_ns, pick.stamp_ns)
+
+    def _observe_depth(
+        self, point: _Point, where: SeenFrom, pick: Pick, depth_m: tuple[float, float], update: Update
+    ) -> None:
+        """The surface's depth under a click. A point on the axis lies a radius behind it, and radii are only roughly
+        known until the pipe's outline is seen: for it this says little, but enough to place one click."""
+        mean, sigma = depth_m
+        if point.role in AXIS_ROLES:
+            mean, sigma = mean + WIDE_RADIUS_M[0], float(np.hypot(sigma, WIDE_RADIUS_M[1]))
+        model = robust(sigmas([sigma]), self._rig.gates.robust_sigma)
+        what = f"stereo depth under pick {pick.point_id}"
+        factor = depth_factor(where.key, keys.point(point.index), mean, model)
+        update.add(factor, Record(FAMILY, f"depth under {pick.point_id}", pick.stamp_ns, what, camera=pick.camera))
+
+    # Pipes ----------------------------------------------------------------------------------------------------
+
+    def outline(self, sighting: OutlineSighting, seen_from: SeenFrom) -> Update:
+        """Two edges of a pipe in one image."""
+        cylinder = self._cylinder(sighting.pipe_id)
+        cylinder.held.append((seen_from, sighting))
+        update = Update()
+        if not cylinder.known and not self._start_pipe(cylinder, update):
+            return update
+        for where, held in cylinder.held:
+            self._observe_outline(cylinder, where, held, update)
+        cylinder.held.clear()
+        for point in self.points.values():
+            self._attach(point, update)
+        return update
+
+    def _cylinder(self, pipe_id: str) -> _Cylinder:
+        if pipe_id not in self.cylinders:
+            self.cylinders[pipe_id] = _Cylinder(len(self.cylinders), Pipe(id=pipe_id))
+        return self.cylinders[pipe_id]
+
+    def _start_pipe(self, cylinder: _Cylinder, update: Update) -> bool:
+        """First axis and radius from the outlines and a point on the pipe."""
+        anchor = next((p for p in self.points.values() if p.known and p.pipe == cylinder.pipe.id), None)
+        if anchor is None or not self._state.has(keys.point(anchor.index)):
+            return False
+        place = self._state.point(keys.point(anchor.index))
+        direction = self._direction(cylinder, place)
+        if direction is None:
+            return False
+        widths = [self._radius(where, sighting, place) for where, sighting in cylinder.held]
+        radius = float(np.median(widths))
+        i = cylinder.index
+        ends = [place - GAUGE_HALF_LENGTH_M * direction, place + GAUGE_HALF_LENGTH_M * direction]
+        for key, end in zip((keys.axis_start(i), keys.axis_end(i)), ends, strict=True):
+            update.guess(key, end)
+            record = Record(
+                "gauge", "axis gauge", cylinder.held[0][1].stamp_ns, "place along the axis", rejectable=False
+            )
+            update.add(axis_gauge(key, end, direction), record)
+        update.guess(keys.radius(i), np.array([np.clip(radius, 0.005, 0.5)]))
+        nominal = cylinder.pipe.nominal_diameter_m
+        mean, sigma = (nominal / 2, cylinder.pipe.diameter_sigma_m / 2) if nominal else WIDE_RADIUS_M
+        record = Record(
+            "calibration priors", "pipe radius", cylinder.held[0][1].stamp_ns, "radius prior", rejectable=False
+        )
+        update.add(radius_prior(i, mean, sigma), record)
+        cylinder.known = True
+        return True
+
+    def _direction(self, cylinder: _Cylinder, place: Float) -> Float | None:
+        """The axis lies in the middle plane of every outline: the direction across all their normals.
+
+        One view fixes only the angle in the image; two views, or two points on the pipe, fix the direction. With one
+        view the axis is taken across the line of sight, for a start.
+        """
+        rows = []
+        for where, sighting in cylinder.held:
+            middle, _ = self._planes(where, sighting)
+            rows.append(middle)
+        others = [
+            self._state.point(keys.point(p.index))
+            for p in self.points.values()
+            if p.known and p.pipe == cylinder.pipe.id and self._state.has(keys.point(p.index))
+        ]
+        normals = np.array(rows)
+        _, singular, vectors = np.linalg.svd(normals)
+        if len(rows) >= 2 and singular[1] > 0.1 * singular[0]:
+            return vectors[-1]
+        spans = [o - place for o in others if np.linalg.norm(o - place) > 0.05]
+        if spans:
+            return spans[0] / np.linalg.norm(spans[0])
+        sight = place - cylinder.held[-1][0].o_T_c.translation()
+        direction = np.cross(normals[-1], sight)
+        length = float(np.linalg.norm(direction))
+        return direction / length if length > 1e-6 else None
+
+    def _planes(self, where: SeenFrom, sighting: OutlineSighting) -> tuple[Float, Float]:
+        """Normal of the middle plane (3,) and both outward normals (2, 3), in {o}."""
+        K = self._state.intrinsics(keys.intrinsics(sighting.camera)).K()
+        normals, _ = line_planes(sighting.lines, K)
+        o_n = normals @ where.o_T_c.rotation().matrix().T
+        middle = o_n[0] - o_n[1]
+        return middle / np.linalg.norm(middle), o_n
+
+    def _radius(self, where: SeenFrom, sighting: OutlineSighting, place: Float) -> float:
+        _, normals = self._planes(where, sighting)
+        distance = normals @ (place - where.o_T_c.translation())
+        return float(-np.mean(distance))
+
+    def _observe_outline(self, cylinder: _Cylinder, where: SeenFrom, sighting: OutlineSighting, update: Update) -> None:
+        i = cylinder.index
+        start, end = (
+            update.values.atPoint3(k) if update.values.exists(k) else self._state.point(k)
+            for k in (keys.axis_start(i), keys.axis_end(i))
+        )
+        a, b = where.o_T_c.transformTo(start), where.o_T_c.transformTo(end)
+        if a[2] < 0.1 or b[2] < 0.1:
+            self.rejected.append(
+                Rejection(
+                    sighting.stamp_ns,
+                    OUTLINE,
+                    f"outline of {cylinder.pipe.id} in {sighting.camera}",
+                    "axis behind the camera, m",
+                    float(min(a[2], b[2])),
+                    0.1,
+                )
+            )
+            return
+        K = self._state.intrinsics(keys.intrinsics(sighting.camera)).K()
+        for side in range(2):
+            # Lines are positive outside the pipe; the factor wants the axis on the positive side.
+            line, own = -sighting.lines[side], sighting.covariance[side] + np.diag([EDGE_FLOOR_PX**2, 0.0])
+            covariance = tangency_covariance(line, own, sighting.foot_px[side], K, a, b)
+            model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
+            factor = outline_factor(sighting.camera, line, model, where.key, i)
+            what = f"edge {side} of {cylinder.pipe.id} in {sighting.camera}"
+            source = f"outline {sighting.camera}"
+            update.add(factor, Record(OUTLINE, source, sighting.stamp_ns, what, camera=sighting.camera))
+        cylinder.outlines += 1
+
+    def _attach(self, point: _Point, update: Update) -> None:
+        """Puts a point on the axis of its pipe, once both are known."""
+        if not point.known or point.on_axis or point.pipe is None:
+            return
+        cylinder = self.cylinders.get(point.pipe)
+        if cylinder is None or not cylinder.known:
+            return
+        factor = on_axis_factor(keys.point(point.index), cylinder.index)
+        record = Record("gauge", "on axis", point.stamp_ns, f"point {point.id} is on the axis", rejectable=False)
+        update.add(factor, record)
+        point.on_axis = True
+
+    def axis(self, pipe_id: str) -> tuple[Float, Float, float] | None:
+        """Axis points in {o} and radius of a pipe as believed now."""
+        cylinder = self.cylinders.get(pipe_id)
+        if cylinder is None or not cylinder.known or not self._state.has(keys.radius(cylinder.index)):
+            return None
+        i = cylinder.index
+        radius = float(self._state.vector(keys.radius(i))[0])
+        return self._state.point(keys.axis_start(i)), self._state.point(keys.axis_end(i)), radius
+
+    def places(self, pipe_id: str) -> list[Float]:
+        """Points on a pipe as believed now, in {o}."""
+        on_it = [p for p in self.points.values() if p.known and p.pipe == pipe_id]
+        return [self._state.point(keys.point(p.index)) for p in on_it if self._state.has(keys.point(p.index))]
+
+    def held_back(self) -> list[Rejection]:
+        """Picks and outlines that never entered."""
+        picks = [
+            Rejection(p.stamp_ns, FAMILY, f"pick {p.point_id} in {p.camera}", "one ray and no depth; views", 1.0, 2.0)
+            for point in self.points.values()
+            for _, p in point.held
+        ]
+        outlines = [
+            Rejection(
+                s.stamp_ns, OUTLINE, f"outline of {c.pipe.id} in {s.camera}", "no point on the pipe; outlines", 1.0, 1.0
+            )
+            for c in self.cylinders.values()
+            for _, s in c.held
+        ]
+        return picks + outlines
+
+
+def _intersection(rays: list[tuple[Float, Float]]) -> Float | None:
+    """The point nearest to all rays, None without parallax."""
+    if len(rays) < 2:
+        return None
+    cosines = [abs(float(a[1] @ b[1])) for a in rays for b in rays]
+    if np.arccos(np.clip(min(cosines), -1, 1)) < MINIMUM_PARALLAX_RAD:
+        return None
+    projectors = [np.eye(3) - np.outer(d, d) for _, d in rays]
+    place = np.linalg.solve(
+        np.sum(projectors, axis=0), np.sum([P @ o for P, (o, _) in zip(projectors, rays, strict=True)], axis=0)
+    )
+    ahead = all(float((place - o) @ d) > 0.05 for o, d in rays)
+    return place if ahead else None

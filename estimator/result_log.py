@@ -1,0 +1,106 @@
+"""The result as an MCAP log of its own: poses, points, ellipsoids, diagnostics, and the whole result as attachment."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..io.build import (
+    point_with_covariance_array,
+    pose_stamped,
+    pose_with_covariance_stamped,
+    tf_message,
+)
+from ..io.build_views import covariance_cloud, diagnostic_array, marker_array_ellipsoids
+from ..io.writer import McapSink
+from .result import PoseEstimate, Result
+from .result_json import to_json
+
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+
+def write_result(path: Path, result: Result) -> None:
+    """Writes the log of estimates; it appears only when it is whole.
+
+    Raises:
+        LogError: the folder is missing, no permission, or the disk is full.
+    """
+    with McapSink(path) as sink:
+        _write_poses(sink, result)
+        _write_points(sink, result)
+        _write_diagnostics(sink, result)
+        sink.attach("result.json", "application/json", to_json(result), result.end_ns)
+        sink.attach("rig.yaml", "application/yaml", result.config_yaml, result.end_ns)
+        sink.metadata("run", {k: str(v) for k, v in result.provenance.items()})
+
+
+def _write_poses(sink: McapSink, result: Result) -> None:
+    start = result.trajectory[0].stamp_ns if result.trajectory else result.end_ns
+    static = [(start, "o", p.name, p.matrix) for p in result.poses if p.name != "m"]
+    if static:
+        sink.write("/tf_static", "tf2_msgs/msg/TFMessage", tf_message(static), start)
+    for pose in result.poses:
+        if pose.name != "m":
+            _write_pose(sink, pose, start)
+    for pose in result.trajectory:
+        sink.write("/tf", "tf2_msgs/msg/TFMessage", tf_message([(pose.stamp_ns, "o", "m", pose.matrix)]), pose.stamp_ns)
+        _write_pose(sink, pose, pose.stamp_ns)
+
+
+def _write_pose(sink: McapSink, pose: PoseEstimate, stamp_ns: int) -> None:
+    name = pose.name if pose.name in ("m", "b") else f"f/{pose.name}"
+    sink.write(f"/estimate/pose/{name}", POSE, pose_stamped(stamp_ns, pose.parent, pose.matrix), stamp_ns)
+    if pose.covariance is not None:
+        message = pose_with_covariance_stamped(stamp_ns, pose.parent, pose.matrix, pose.covariance)
+        sink.write(f"/estimate/pose_with_covariance/{name}", POSE_COVARIANCE, message, stamp_ns)
+
+
+def _write_points(sink: McapSink, result: Result) -> None:
+    if not result.points:
+        return
+    stamp, frame = result.end_ns, "b"
+    named = {p.id: (p.position_m, p.covariance_m2) for p in result.points}
+    pairs = list(named.values())
+    array = "surecut_msgs/msg/PointWithCovarianceArray"
+    sink.write("/estimate/points", array, point_with_covariance_array(stamp, frame, named), stamp)
+    sink.write("/estimate/points_cloud", "sensor_msgs/msg/PointCloud2", covariance_cloud(stamp, frame, pairs), stamp)
+    ellipsoids = marker_array_ellipsoids(stamp, frame, "points", pairs)
+    sink.write("/estimate/points_ellipsoids", "visualization_msgs/msg/MarkerArray", ellipsoids, stamp)
+
+
+def _write_diagnostics(sink: McapSink, result: Result) -> None:
+    consistency = result.consistency
+    rows = []
+    for family in consistency.by_family:
+        ratio = family.chi2 / family.dof if family.dof > 0 else float("nan")
+        level = "warn" if ratio > family.upper else "ok"
+        values = {"chi2": f"{family.chi2:.3f}", "dof": f"{family.dof:.1f}", "limit": f"{family.upper:.3f}"}
+        values["residuals"] = str(family.residuals)
+        rows.append((level, f"residuals/{family.family}", f"chi2/dof {ratio:.2f}", values))
+    overall = "ok" if consistency.passed else "error"
+    text = "consistent" if consistency.passed else "; ".join(consistency.reasons)
+    rows.append((overall, "health", text, {}))
+    sink.write(
+        "/estimate/health", "diagnostic_msgs/msg/DiagnosticArray", diagnostic_array(result.end_ns, rows), result.end_ns
+    )
+    severity = {"info": "ok", "warning": "warn", "error": "error"}
+    for event in result.events:
+        values = {k: f"{v:.6g}" for k, v in event.values.items()}
+        status = diagnostic_array(event.stamp_ns, [(severity[event.severity], event.kind, event.text, values)])
+        sink.write("/estimate/events", "diagnostic_msgs/msg/DiagnosticArray", status, event.stamp_ns)
+    for rejection in result.rejected:
+        values = {"value": f"{rejection.value:.6g}", "limit": f"{rejection.limit:.6g}", "family": rejection.family}
+        status = diagnostic_array(rejection.stamp_ns, [("warn", rejection.what, rejection.reason, values)])
+        sink.write("/estimate/rejected", "diagnostic_msgs/msg/DiagnosticArray", status, rejection.stamp_ns)
+
+
+def tum_text(result: Result) -> str:
+    """`o_T_m` in TUM format: time [s], translation [m], quaternion x y z w; one line per frame."""
+    from scipy.spatial.transform import Rotation
+
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for pose in result.trajectory:
+        q = Rotation.from_matrix(pose.matrix[:3, :3]).as_quat()
+        numbers = " ".join(f"{x:.9f}" for x in np.concatenate([pose.matrix[:3, 3], q]))
+        lines.append(f"{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} {numbers}")
+    return "\n".join(lines) + "\n"

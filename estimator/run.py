@@ -1,0 +1,56 @@
+"""Measurements to result: the one loop, its end, and the batch refinement."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from ..factors.camera import CameraModel
+from ..factors.errors import ObservabilityError
+from ..factors.measurements import Event, Rejection
+from ..factors.rig import Rig
+from .batch import solve
+from .engine import Engine, bundles
+from .result import Result
+from .summary import Summary
+from .surfaces import Associator
+
+SETTLE_ROUNDS = 10
+
+
+def finish(
+    engine: Engine,
+    between: tuple[tuple[str, str], ...] = (),
+    timing: Mapping[str, float] | None = None,
+    provenance: Mapping[str, str] | None = None,
+    rejected: Sequence[Rejection] = (),
+    events: Sequence[Event] = (),
+) -> Result:
+    """Settles iSAM2, refines in batch over the same factors, and reads the result.
+
+    Raises:
+        ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
+    """
+    engine.revisit()
+    engine.flush()
+    if engine.odometry.last_keyframe < 0:
+        raise ObservabilityError(
+            "there is nothing to estimate: no stereo pair and no known marker was seen; check topics and marker ids in "
+            "the rig file (`surecut info LOG`)"
+        )
+    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
+    solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    engine.rejected += rejected
+    engine.events += events
+    return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))
+
+
+def estimate(
+    measurements: Iterable[object],
+    rig: Rig,
+    cameras: Mapping[str, CameraModel],
+    associate: Associator,
+    between: tuple[tuple[str, str], ...] = (),
+) -> Result:
+    """The result of measurements that are at hand already, such as simulated ones or a robot's own."""
+    engine = Engine(rig, cameras, associate)
+    for bundle in bundles(list(measurements)):
+        engine.add(bundle)
+    return finish(engine, between)

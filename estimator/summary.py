@@ -1,0 +1,328 @@
+"""From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors import keys
+from ..factors.board import mean_point
+from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
+from ..factors.errors import ObservabilityError
+from ..factors.geometry import ros_covariance
+from ..factors.rig import dump_rig
+from .batch import BatchSolution
+from .consistency import family_tests, judge, prior_tests
+from .engine import Engine
+from .graph import Record
+from .linear import LinearSystem
+from .marker_points import parse_point
+from .points_in_base import pipe_estimate, point_blocks, radius95
+from .result import (
+    CalibrationEstimate,
+    Consistency,
+    DistanceEstimate,
+    PipeEstimate,
+    PointEstimate,
+    PoseEstimate,
+    Result,
+)
+
+Float = NDArray[np.float64]
+INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
+"""Names of the intrinsics' components; the skew is not reported."""
+Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
+
+
+class Summary:
+    """Reads one solution. Every covariance comes from the same linear system."""
+
+    def __init__(self, engine: Engine, solution: BatchSolution) -> None:
+        self._engine = engine
+        self._values = solution.values
+        self._solution = solution
+        off = set(solution.outliers)
+        self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor, _ in self._active:
+            graph.add(factor)
+        self._graph = graph
+        self._system = LinearSystem(graph, solution.values)
+
+    def result(
+        self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
+    ) -> Result:
+        engine = self._engine
+        consistency = self._consistency()
+        points = self._points()
+        return Result(
+            points=points,
+            poses=self._poses(),
+            trajectory=self._trajectory(),
+            pipes=self._pipes(points),
+            calibration=self._calibration(),
+            distances=self._distances(between),
+            consistency=consistency,
+            rejected=(*engine.everything_rejected(), *self._solution.rejected),
+            events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
+            streaming_difference_sigma=self._streaming_difference(),
+            timing=timing,
+            provenance=provenance,
+            config_yaml=dump_rig(engine.rig),
+            last_board_view_ns=engine.boards.last_seen_ns(),
+            end_ns=engine.end_ns,
+        )
+
+    # Points ---------------------------------------------------------------------------------------------------
+
+    def _points(self) -> tuple[PointEstimate, ...]:
+        engine, base = self._engine, keys.base(0)
+        known = [p for p in engine.pipes.points.values() if p.known]
+        if known and not self._values.exists(base):
+            raise ObservabilityError(why_no_base(engine))
+        return tuple(self._point(p.id) for p in known)
+
+    def _point(self, name: str) -> PointEstimate:
+        point = self._engine.pipes.points[name]
+        position, blocks = point_blocks(self._values, keys.base(0), keys.point(point.index))
+        influence = self._system.influence(blocks)
+        covariance = influence.T @ influence
+        axis = None
+        if point.on_axis and point.pipe is not None:
+            axis = self._axis(self._engine.pipes.cylinders[point.pipe].index)
+        return PointEstimate(
+            id=point.id,
+            role=point.role,
+            frame="b",
+            position_m=position,
+            covariance_m2=covariance,
+            radius95_m=radius95(covariance),
+            measurements=point.picks,
+            axis=axis,
+            pipe_id=point.pipe if point.on_axis else None,
+            budget=self._budget(influence),
+        )
+
+    def _axis(self, index: int) -> Float:
+        o_T_b = self._values.atPose3(keys.base(0))
+        span = self._values.atPoint3(keys.axis_end(index)) - self._values.atPoint3(keys.axis_start(index))
+        return o_T_b.rotation().matrix().T @ (span / np.linalg.norm(span))
+
+    def _budget(self, influence: Float) -> dict[str, Float]:
+        """Share of every source in a covariance: with A the whitened Jacobian, J (A^T A)^-1 J^T is the sum over the
+        rows of A of (J (A^T A)^-1 a_i)^2, so the sources' shares sum to it exactly."""
+        shares: dict[str, Float] = {}
+        for position, (_, _, record) in enumerate(self._active):
+            rows = influence[self._system.starts[position] : self._system.starts[position + 1]]
+            name = f"{record.family}: {record.source}" if record.source != record.family else record.family
+            shares[name] = shares.get(name, np.zeros((3, 3))) + rows.T @ rows
+        return dict(sorted(shares.items(), key=lambda item: -float(np.trace(item[1]))))
+
+    def _pipes(self, points: tuple[PointEstimate, ...]) -> tuple[PipeEstimate, ...]:
+        found = []
+        for name, cylinder in self._engine.pipes.cylinders.items():
+            if not cylinder.known or not self._values.exists(keys.base(0)):
+                continue
+            on_it = [p.position_m for p in points if p.pipe_id == name]
+            near = np.mean(on_it, axis=0) if on_it else np.zeros(3)
+            found.append(pipe_estimate(name, "b", cylinder.index, keys.base(0), near, self._values, self._system))
+        return tuple(found)
+
+    # Poses ----------------------------------------------------------------------------------------------------
+
+    def _poses(self) -> tuple[PoseEstimate, ...]:
+        engine = self._engine
+        named = []
+        if self._values.exists(keys.base(0)):
+            named.append(("b", keys.base(0), engine.end_ns))
+        for board in engine.rig.boards:
+            if engine.boards.known(board.id):
+                named.append((board.id, engine.boards.key(board.id), engine.end_ns))
+        last = engine.odometry.last_keyframe
+        if last >= 0:
+            named.append(("m", keys.keyframe(last), engine.odometry.keyframe_stamps[last]))
+        return tuple(self._pose(name, key, stamp) for name, key, stamp in named)
+
+    def _pose(self, name: str, key: int, stamp_ns: int) -> PoseEstimate:
+        pose = self._values.atPose3(key)
+        covariance = ros_covariance(pose, self._system.joint([key]))
+        return PoseEstimate(name, "o", stamp_ns, pose.matrix(), covariance)
+
+    def _trajectory(self) -> tuple[PoseEstimate, ...]:
+        engine = self._engine
+        covariances = self._keyframe_covariances()
+        poses = []
+        for frame in sorted(engine.odometry.frames, key=lambda f: f.stamp_ns):
+            o_T_k = self._values.atPose3(keys.keyframe(frame.keyframe))
+            matrix = o_T_k.matrix() @ frame.keyframe_T_this
+            own = engine.odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns
+            covariance = ros_covariance(o_T_k, covariances[frame.keyframe]) if own else None
+            poses.append(PoseEstimate("m", "o", frame.stamp_ns, matrix, covariance))
+        return tuple(poses)
+
+    def _keyframe_covariances(self) -> list[Float]:
+        """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
+        marginals = gtsam.Marginals(self._graph, self._values)
+        count = self._engine.odometry.last_keyframe + 1
+        return [marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
+
+    # Calibration and distances --------------------------------------------------------------------------------
+
+    def _calibration(self) -> tuple[CalibrationEstimate, ...]:
+        rows: list[CalibrationEstimate] = []
+        engine, rig = self._engine, self._engine.rig
+        for camera in keys.CAMERA_INDEX:
+            if self._values.exists(keys.intrinsics(camera)):
+                model, settings = engine.cameras[camera], getattr(rig.cameras, camera)
+                prior = np.sqrt(np.diag(intrinsics_covariance(model, settings)))
+                mean = np.array([model.fx, model.fy, 0.0, model.cx, model.cy, 0.0, 0.0, 0.0, 0.0])
+                value = self._values.atCal3DS2(keys.intrinsics(camera)).vector()
+                sigma = self._sigmas(keys.intrinsics(camera))
+                frozen = ["focal" in settings.freeze] * 2 + [True] + ["centre" in settings.freeze] * 2
+                frozen += ["distortion" in settings.freeze] * 4
+                for i, part in enumerate(INTRINSICS):
+                    if part is None:
+                        continue
+                    rows.append(
+                        CalibrationEstimate(
+                            f"{camera}.{part}", "px" if i < 5 else "1", value[i], sigma[i], mean[i], prior[i], frozen[i]
+                        )
+                    )
+        rows += self._extrinsic_rows()
+        if self._values.exists(keys.DEPTH):
+            value, sigma, prior = self._values.atVector(keys.DEPTH), self._sigmas(keys.DEPTH), depth_sigmas(rig.kinect)
+            freeze = rig.kinect.freeze
+            rows.append(
+                CalibrationEstimate("depth_offset", "m", value[0], sigma[0], 0.0, prior[0], "depth_offset" in freeze)
+            )
+            rows.append(
+                CalibrationEstimate("depth_scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
+            )
+        for board in rig.boards:
+            page = keys.page(engine.boards.index(board.id))
+            if self._values.exists(page):
+                value, sigma = self._values.atVector(page), self._sigmas(page)
+                rows.append(
+                    CalibrationEstimate(
+                        f"{board.id}.side", "m", value[0], sigma[0], board.side_m, board.side_sigma_m, False
+                    )
+                )
+                rows.append(
+                    CalibrationEstimate(
+                        f"{board.id}.print_scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
+                    )
+                )
+        return tuple(rows)
+
+    def _extrinsic_rows(self) -> list[CalibrationEstimate]:
+        rig, rows = self._engine.rig, []
+        named = []
+        if self._values.exists(keys.extrinsics("m_right")):
+            mean = left_T_right(self._engine.cameras["m_left"], self._engine.cameras["m_right"], rig.stereo)
+            spread = np.sqrt(np.diag(stereo_sigmas(mean, rig.stereo)))
+            named.append(("m_left_T_m_right", keys.extrinsics("m_right"), mean, spread, rig.stereo.freeze))
+        if self._values.exists(keys.extrinsics("b_rgb")):
+            named.append(
+                (
+                    "b_T_rgb",
+                    keys.extrinsics("b_rgb"),
+                    rgb_mean(rig.kinect),
+                    rgb_sigmas(rig.kinect),
+                    "b_T_rgb" in rig.kinect.freeze,
+                )
+            )
+        for name, key, mean, spread, frozen in named:
+            moved = gtsam.Pose3.Logmap(mean.between(self._values.atPose3(key)))
+            sigma = self._sigmas(key)
+            for i, part in enumerate(("rx", "ry", "rz")):
+                rows.append(CalibrationEstimate(f"{name}.{part}", "rad", moved[i], sigma[i], 0.0, spread[i], frozen))
+            nominal = mean.rotation().matrix().T @ mean.translation()
+            for i, part in enumerate(("tx", "ty", "tz")):
+                rows.append(
+                    CalibrationEstimate(
+                        f"{name}.{part}",
+                        "m",
+                        nominal[i] + moved[3 + i],
+                        sigma[3 + i],
+                        nominal[i],
+                        spread[3 + i],
+                        frozen,
+                    )
+                )
+        return rows
+
+    def _sigmas(self, key: int) -> Float:
+        return np.sqrt(np.clip(np.diag(self._system.joint([key])), 0.0, None))
+
+    def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
+        rig = self._engine.rig
+        found = []
+        asked = [(d.point_a, d.point_b, d.distance_m, d.sigma_m) for d in rig.distances]
+        for a, b, given, given_sigma in [*asked, *((a, b, None, None) for a, b in between)]:
+            estimate = self._distance(a, b)
+            if estimate is None:
+                if given is None:
+                    raise ObservabilityError(f"distance {a} to {b}: one of the two markers was never placed by the log")
+                continue
+            found.append(DistanceEstimate(f"{a} to {b}", *estimate, given, given_sigma))
+        return tuple(found)
+
+    def _distance(self, a: str, b: str) -> tuple[float, float] | None:
+        points = [self._engine.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]
+        if points[0] is None or points[1] is None:
+            return None
+        difference = mean_point(self._values, points[0]) - mean_point(self._values, points[1])
+        length = float(np.linalg.norm(difference))
+        if length == 0.0:
+            return 0.0, 0.0
+        unit = (difference / length)[None, :]
+        blocks = [(k, unit / len(points[0])) for k in points[0]] + [(k, -unit / len(points[1])) for k in points[1]]
+        return length, float(np.sqrt(self._system.covariance(blocks)[0, 0]))
+
+    # Consistency ----------------------------------------------------------------------------------------------
+
+    def _consistency(self) -> Consistency:
+        engine = self._engine
+        families = family_tests(
+            engine.solver.log, self._active, self._system, self._values, engine.rig.gates.robust_sigma
+        )
+        tested = ("mount", "known distances", "board geometry", "calibration priors")
+        priors = prior_tests(self._active, self._system, tested)
+        paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
+        return judge(families, priors, paths)
+
+    def _streaming_difference(self) -> dict[str, float]:
+        """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""
+        first, last = self._solution.first_values, self._engine.state.values
+        worst: dict[str, float] = {}
+        names = {
+            "b": "o_T_b",
+            "f": "o_T_f",
+            "p": "points",
+            "x": "o_T_m",
+            "k": "intrinsics",
+            "e": "extrinsics",
+            "h": "pages",
+        }
+        count = self._engine.odometry.last_keyframe
+        moved = first.localCoordinates(last)
+        for key in self._system.columns:
+            kind = keys.kind(key)
+            if kind not in names or (kind == "x" and key not in (keys.keyframe(count), keys.keyframe(count // 2))):
+                continue
+            delta = moved.at(key)
+            sigma = np.maximum(self._sigmas(key), 1e-12)
+            worst[names[kind]] = max(worst.get(names[kind], 0.0), float(np.max(np.abs(delta) / sigma)))
+        return worst
+
+
+def why_no_base(engine: Engine) -> str:
+    """The missing link between {o} and {b}, in words."""
+    if engine.rig.mount is None:
+        return "{b} is not observable: the rig has no mount (f_T_b); add the section `mount` to the rig file"
+    board = engine.rig.mount.board
+    if not engine.boards.known(board):
+        return (
+            f"{{b}} is not observable: board {board} was never seen by the mobile camera well enough to be placed; "
+            "record a view of the whole board from 1 to 1.5 m, or correct the marker ids in the rig file"
+        )
+    return "{b} is not observable: nothing ties the Kinect to the mobile camera"

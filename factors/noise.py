@@ -1,0 +1,47 @@
+"""Noise models: covariance in, robust loss around it. Rotation comes first in Pose3 tangents."""
+
+from functools import cache
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+
+Float = NDArray[np.float64]
+Model = gtsam.noiseModel.Base
+
+
+def gaussian(covariance: Float) -> Model:
+    """Full covariance, shape (n, n)."""
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def sigmas(values: Float | list[float]) -> Model:
+    """Independent components."""
+    return gtsam.noiseModel.Diagonal.Sigmas(np.asarray(values, float))
+
+
+def pose_sigmas(rotation_rad: float, translation_m: float) -> Model:
+    """Isotropic in rotation and in translation."""
+    return sigmas([rotation_rad] * 3 + [translation_m] * 3)
+
+
+def huber(model: Model, scale: float) -> Model:
+    """Residuals beyond `scale` sigmas pull with constant force."""
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(scale), model)
+
+
+@cache
+def robust_scale(robust_sigma: float, dimension: int) -> float:
+    """Norm of a whitened residual beyond which it is softened: as rare as `robust_sigma` is for one dimension."""
+    return float(np.sqrt(chi2.ppf(2.0 * norm.cdf(robust_sigma) - 1.0, dimension)))
+
+
+def robust(model: Model, robust_sigma: float) -> Model:
+    """Huber around a model, with the scale that suits its dimension."""
+    return huber(model, robust_scale(robust_sigma, model.dim()))
+
+
+def huber_norm(loss: float, scale: float) -> float:
+    """Whitened residual norm from a Huber factor's `error`, the inverse of the loss."""
+    return float(np.sqrt(2.0 * loss)) if loss <= 0.5 * scale * scale else loss / scale + 0.5 * scale

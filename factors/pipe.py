@@ -1,0 +1,201 @@
+"""A pipe as a cylinder: an axis through two points of {o}, and a radius. Outlines, picks and priors hold it.
+
+Only the line through the two axis points means something; where they lie on it is fixed once, as a gauge.
+"""
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from . import keys
+from .geometry import point_to_frame
+from .noise import Model, gaussian, sigmas
+
+Float = NDArray[np.float64]
+
+ON_AXIS_SIGMA_M = 1e-4
+"""How exactly a cut point lies on the axis: a tenth of a millimetre, far below any measurement here."""
+
+
+def line_planes(lines: Float, K: Float) -> tuple[Float, Float]:
+    """Unit normals of the planes through the camera centre and image lines.
+
+    Args:
+        lines: shape (n, 3), homogeneous, in ideal pixels.
+        K: shape (3, 3).
+
+    Returns:
+        normals (n, 3), and the lengths (n,) of `K^T l` that were divided out.
+    """
+    normals = lines @ K
+    lengths = np.linalg.norm(normals, axis=1)
+    return normals / lengths[:, None], lengths
+
+
+def tangency(line: Float, K: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
+    """An outline's plane touches the cylinder: `n . p = radius` for the axis points p = a, b in the camera frame.
+
+    Args:
+        line: shape (3,), oriented so that the axis lies on the positive side.
+
+    Returns:
+        residual (2,) in metres, d residual / d (a, b, radius) (2, 7),
+        d residual / d (fx, fy, skew, cx, cy) (2, 5).
+    """
+    normals, lengths = line_planes(line[None], K)
+    n = normals[0]
+    points = np.stack([a, b])
+    distance = points @ n
+    shape_jacobian = np.zeros((2, 7))
+    shape_jacobian[0, :3] = n
+    shape_jacobian[1, 3:6] = n
+    shape_jacobian[:, 6] = -1.0
+    # n = m / |m| with m = K^T l: d(n . p) = (p - (n . p) n) . dm / |m|
+    across = (points - distance[:, None] * n) / lengths[0]
+    l0, l1, _ = line
+    dm = np.array([[l0, 0, 0], [0, l1, 0], [0, l0, 0], [0, 0, l0], [0, 0, l1]])
+    return distance - radius, shape_jacobian, across @ dm.T
+
+
+def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float, a: Float, b: Float) -> Float:
+    """Covariance of `tangency`'s residual, shape (2, 2), from the line's own.
+
+    Args:
+        covariance: shape (2, 2), of the line's offset [px] at its foot and of its direction [rad].
+        foot_px: shape (2,), the point of the line where the offset is meant.
+        a, b: the axis points in the camera frame, as estimated.
+    """
+    _, lengths = line_planes(line[None], K)
+    direction = np.array([-line[1], line[0]])
+    G = np.empty((2, 2))
+    for row, p in enumerate((a, b)):
+        pixel = (K @ p)[:2] / p[2]
+        # l . (u, v, 1) is the distance in pixels; n . p = z * that / |K^T l|
+        G[row] = p[2] / lengths[0] * np.array([1.0, float(direction @ (pixel - foot_px))])
+    return G @ covariance @ G.T + np.eye(2) * 1e-10
+
+
+def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
+    """One edge of a pipe in one image.
+
+    Args:
+        camera: `m_left`, `m_right` or `b_rgb`.
+        line: shape (3,), see `tangency`.
+        noise: of the residual (2,), see `tangency_covariance`.
+        pose: key of `o_T_m` or `o_T_b`.
+        pipe: index of the pipe.
+    """
+    variables = [pose, keys.intrinsics(camera), keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
+    if camera != "m_left":
+        variables.append(keys.extrinsics(camera))
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        o_T_c = values.atPose3(pose)
+        c_T_s = values.atPose3(variables[5]) if len(variables) == 6 else None
+        K = values.atCal3DS2(variables[1]).K()
+        seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
+        radius = float(values.atVector(variables[4])[0])
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], radius)
+        if jacobians is not None:
+            d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
+            jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
+            # Edges were fitted in ideal pixels; what the lens model leaves over is far below their sigma.
+            jacobians[1] = np.hstack([d_K, np.zeros((2, 4))])
+            jacobians[2] = d_a @ seen[0][2]
+            jacobians[3] = d_b @ seen[1][2]
+            jacobians[4] = d_shape[:, 6:]
+            if c_T_s is not None:
+                jacobians[5] = d_a @ seen[0][3] + d_b @ seen[1][3]
+        return residual
+
+    return gtsam.CustomFactor(noise, variables, error)
+
+
+def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:
+    """A point in the sensor's frame; Jacobians for the pose, the point and the extrinsics."""
+    c_p, d_pose, d_point = point_to_frame(o_T_c, o_p)
+    if c_T_s is None:
+        return c_p, d_pose, d_point, np.zeros((3, 6))
+    s_p, d_extrinsics, d_c = point_to_frame(c_T_s, c_p)
+    return s_p, d_c @ d_pose, d_c @ d_point, d_extrinsics
+
+
+def on_axis_factor(point: int, pipe: int) -> gtsam.CustomFactor:
+    """A cut point lies on the pipe's axis: its distance from the line, residual (3,) in metres (rank 2)."""
+    variables = [point, keys.axis_start(pipe), keys.axis_end(pipe)]
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        p, a, b = (values.atPoint3(key) for key in variables)
+        length = float(np.linalg.norm(b - a))
+        d = (b - a) / length
+        across = np.eye(3) - np.outer(d, d)
+        arm = float(d @ (p - a))
+        if jacobians is not None:
+            # residual = across (p - a); d turns with b - a
+            turn = -(arm * across + np.outer(d, across @ (p - a))) / length
+            jacobians[0] = across
+            jacobians[1] = -across - turn
+            jacobians[2] = turn
+        return across @ (p - a)
+
+    return gtsam.CustomFactor(sigmas([ON_AXIS_SIGMA_M] * 3), variables, error)
+
+
+def axis_gauge(
+    key: int, point: Float, direction: Float, along_m: float = 1e-3, across_m: float = 10.0
+) -> gtsam.NonlinearFactor:
+    """Fixes where an axis point lies along the axis; across it says nothing (10 m)."""
+    d = direction / np.linalg.norm(direction)
+    along = np.outer(d, d)
+    return gtsam.PriorFactorPoint3(key, point, gaussian(along * along_m**2 + (np.eye(3) - along) * across_m**2))
+
+
+def radius_prior(pipe: int, radius_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
+    """Half the nominal diameter, or a wide prior that says only what pipes there are."""
+    return gtsam.PriorFactorVector(keys.radius(pipe), np.array([radius_m]), sigmas([sigma_m]))
+
+
+def cylinder_factor(
+    point_a_m: Float, point_b_m: Float, radius_m: float, covariance: Float, pose: int, pipe: int
+) -> gtsam.CustomFactor:
+    """A cylinder fitted to a cloud, as one summarised factor.
+
+    The estimated axis passes the fitted one at the two fitted points: residual (5,) = offsets of the axis from
+    point_a and from point_b in two directions across it, and the radius. `covariance` (5, 5) is of the same.
+    """
+    d_fit = (point_b_m - point_a_m) / np.linalg.norm(point_b_m - point_a_m)
+    e1 = np.cross(d_fit, np.eye(3)[int(np.argmin(np.abs(d_fit)))])
+    e1 /= np.linalg.norm(e1)
+    E = np.stack([e1, np.cross(d_fit, e1)])
+    variables = [pose, keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        o_T_c = values.atPose3(pose)
+        a, Ja, Ra = point_to_frame(o_T_c, values.atPoint3(variables[1]))
+        b, Jb, Rb = point_to_frame(o_T_c, values.atPoint3(variables[2]))
+        residual = np.empty(5)
+        d_a, d_b = np.zeros((5, 3)), np.zeros((5, 3))
+        for i, q in enumerate((point_a_m, point_b_m)):
+            offset, by_a, by_b = _axis_at(a, b, q, d_fit)
+            rows = slice(2 * i, 2 * i + 2)
+            residual[rows] = E @ offset
+            d_a[rows], d_b[rows] = E @ by_a, E @ by_b
+        residual[4] = values.atVector(variables[3])[0] - radius_m
+        if jacobians is not None:
+            jacobians[0] = d_a @ Ja + d_b @ Jb
+            jacobians[1] = d_a @ Ra
+            jacobians[2] = d_b @ Rb
+            jacobians[3] = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
+        return residual
+
+    return gtsam.CustomFactor(gaussian(covariance), variables, error)
+
+
+def _axis_at(a: Float, b: Float, q: Float, normal: Float) -> tuple[Float, Float, Float]:
+    """Where the line a-b crosses the plane through q with `normal`, less q; Jacobians for a and b."""
+    slope = float(normal @ (b - a))
+    s = float(normal @ (q - a)) / slope
+    offset = a + s * (b - a) - q
+    ds_a = (s - 1.0) * normal / slope
+    ds_b = -s * normal / slope
+    return offset, (1 - s) * np.eye(3) + np.outer(b - a, ds_a), s * np.eye(3) + np.outer(b - a, ds_b)

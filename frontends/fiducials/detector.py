@@ -1,0 +1,247 @@
+"""The marker front end of one camera: images in, corners with covariances out, at video rate."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ...factors.camera import CameraModel
+from ...factors.measurements import CameraName, MarkerSighting, Rejection
+from ...factors.rig import Board, Rig
+from ..undistort import distort, undistort
+from .board_layout import predict_missing
+from .dictionaries import MarkerDictionary, marker_dictionary
+from .pattern_fit import PatternFit, Window, fit_patterns, surroundings
+from .search import Candidate, MarkerSearch
+
+Float = NDArray[np.float64]
+
+CORNER_FLOOR_PX = 0.004
+"""What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
+_MIN_CORRELATION = 0.80
+"""Pixels with the fitted pattern, for a marker that was read."""
+_MIN_CORRELATION_PREDICTED = 0.90
+"""The same for one that was only expected there."""
+_MIN_CONTRAST = 8.0
+"""Grey values between black and white."""
+_MIN_SHARE = 0.5
+"""Of the pattern's edges, what has to be seen as the model says."""
+_SETTLED_PX = 0.1
+_MAX_SIGMA_CELLS = 0.5
+"""A corner that is not known to half a cell is no measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Fitted:
+    """A candidate after the fit."""
+
+    candidate: Candidate
+    corners: Float
+    covariance: Float
+    correlation: float
+    contrast: float
+    problem: tuple[str, float, float] | None
+    """Reason, value and limit of a refusal."""
+
+
+class MarkerFrontEnd:
+    """Finds the rig's markers in the images of one camera.
+
+    Keeps where the boards were last, looks there first, and at the whole image in a slower rhythm or when something is
+    missing. Markers that were not read although their board was are looked for where they must be.
+    """
+
+    def __init__(self, rig: Rig, camera: CameraModel, camera_name: CameraName) -> None:
+        """
+        Raises:
+            RigError: a board's dictionary is not one that OpenCV can find in images.
+            SurecutError: the camera's distortion model is unknown.
+        """
+        self._camera = camera
+        self._name: CameraName = camera_name
+        self._boards: dict[tuple[str, int], Board] = {}
+        self._dictionaries: dict[str, MarkerDictionary] = {}
+        self._patterns: dict[tuple[str, int], Float] = {}
+        for board in rig.boards:
+            dictionary = marker_dictionary(board.dictionary)
+            self._dictionaries[dictionary.name] = dictionary
+            for marker in board.markers:
+                self._boards[dictionary.name, marker.id] = board
+                if marker.id < dictionary.size:
+                    self._patterns[dictionary.name, marker.id] = dictionary.pattern(marker.id)
+        self._search = MarkerSearch(tuple(self._dictionaries.values()))
+        self._positions: Float | None = None
+        if not _is_pinhole(camera):
+            columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+            self._positions = undistort(camera, np.stack([columns, rows], -1))[0]
+
+    def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> tuple[list[MarkerSighting], list[Rejection]]:
+        """The markers in one image, and what was refused.
+
+        Args:
+            stamp_ns: the sensor's time.
+            image: shape (height, width) grey or (height, width, 3) BGR.
+        """
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = np.ascontiguousarray(grey, np.uint8)
+        found = self._search.find(grey)
+        known = [c for c in found if (c.dictionary, c.marker) in self._patterns]
+        unknown = [c for c in found if (c.dictionary, c.marker) not in self._patterns]
+        rejections = [] if not unknown else [self._unknown(stamp_ns, unknown)]
+        fitted = self._fit(grey, known, _MIN_CORRELATION)
+        good, refused = self._one_per_marker([f for f in fitted if f.problem is None])
+        refused += [f for f in fitted if f.problem is not None]
+        good += self._expected(grey, good)
+        rejections += [self._rejection(stamp_ns, f) for f in refused]
+        sightings = [self._sighting(stamp_ns, f) for f in good]
+        self._search.remember([s.raw_px for s in sightings], grey.shape)
+        return sightings, rejections
+
+    def _expected(self, grey: NDArray[np.uint8], good: list[_Fitted]) -> list[_Fitted]:
+        """Markers of the boards in view that were not read, where they fit the image."""
+        seen = {f.candidate.key: f.corners for f in good}
+        missing = []
+        for (dictionary, marker), corners in predict_missing(self._boards, seen).items():
+            if (dictionary, marker) in self._patterns and self._in_view(corners, grey.shape):
+                missing.append(Candidate(dictionary, marker, corners))
+        fitted = self._fit(grey, missing, _MIN_CORRELATION_PREDICTED, ideal=True)
+        contrast = np.median([f.contrast for f in good]) if good else 0.0
+        return [f for f in fitted if f.problem is None and f.contrast > 0.4 * contrast]
+
+    def _in_view(self, ideal: Float, shape: tuple[int, ...]) -> bool:
+        raw = distort(self._camera, ideal)
+        inside = (raw > 2) & (raw < [shape[1] - 3, shape[0] - 3])
+        area = cv2.contourArea(ideal.astype(np.float32))
+        return bool(inside.all()) and area > 60.0
+
+    def _fit(
+        self, grey: NDArray[np.uint8], candidates: list[Candidate], min_correlation: float, ideal: bool = False
+    ) -> list[_Fitted]:
+        """Fits of the candidates, markers with the same number of cells together."""
+        result = []
+        for cells in sorted({self._dictionaries[c.dictionary].cells for c in candidates}):
+            group = [c for c in candidates if self._dictionaries[c.dictionary].cells == cells]
+            starts = np.stack([self._ours(c, ideal) for c in group])
+            keep = np.isfinite(starts).all((1, 2))
+            group, starts = [c for c, k in zip(group, keep, strict=True) if k], starts[keep]
+            if group:
+                patterns = [self._patterns[c.key] for c in group]
+                fit = fit_patterns(grey, starts, patterns, self._positions, self._windows(starts, cells, grey.shape))
+                result += [_judged(c, starts[k], fit, k, cells, min_correlation) for k, c in enumerate(group)]
+        return result
+
+    def _windows(self, ideal: Float, cells: int, shape: tuple[int, ...]) -> list[Window] | None:
+        """Where to find the pixels of markers in an image that the lens has bent."""
+        if self._positions is None:
+            return None
+        middles = (ideal + np.roll(ideal, 1, axis=1)) / 2
+        outline = distort(self._camera, np.concatenate([ideal, middles], axis=1))
+        boxes = np.stack([np.nanmin(outline, axis=1), np.nanmax(outline, axis=1)], 1)[:, [0, 0, 1, 1]]
+        boxes[:, 1, 1], boxes[:, 3, 1] = boxes[:, 2, 1], boxes[:, 0, 1]
+        return [surroundings(box, cells, (shape[1], shape[0])) for box in boxes]
+
+    def _ours(self, candidate: Candidate, ideal: bool) -> Float:
+        if ideal:
+            return candidate.corners
+        order = self._dictionaries[candidate.dictionary].from_opencv
+        return undistort(self._camera, candidate.corners[list(order)])[0]
+
+    def _one_per_marker(self, fitted: list[_Fitted]) -> tuple[list[_Fitted], list[_Fitted]]:
+        """One place per marker. Where a marker stands twice in the image, the rest of its board decides, or none."""
+        good, refused = [], []
+        by_marker: dict[tuple[str, int], list[_Fitted]] = {}
+        for f in fitted:
+            by_marker.setdefault(f.candidate.key, []).append(f)
+        single = {key: fs[0].corners for key, fs in by_marker.items() if len(fs) == 1}
+        for key, fs in by_marker.items():
+            if len(fs) == 1:
+                good.append(fs[0])
+                continue
+            distinct = _distinct(fs)
+            if len(distinct) == 1:
+                good.append(distinct[0])
+                continue
+            expected = predict_missing(self._boards, single).get(key)
+            size = np.linalg.norm(distinct[0].corners[2] - distinct[0].corners[0])
+            for f in distinct:
+                off = np.inf if expected is None else float(np.abs(f.corners - expected).max())
+                if off < 0.25 * size:
+                    good.append(f)
+                else:
+                    refused.append(
+                        _refused(f, "stands in the image more than once, number of places", len(distinct), 1)
+                    )
+        return good, refused
+
+    def _sighting(self, stamp_ns: int, fitted: _Fitted) -> MarkerSighting:
+        blocks = np.stack([fitted.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
+        return MarkerSighting(
+            stamp_ns,
+            self._name,
+            self._boards[fitted.candidate.key].id,
+            fitted.candidate.marker,
+            fitted.corners,
+            blocks + CORNER_FLOOR_PX**2 * np.eye(2),
+            distort(self._camera, fitted.corners),
+        )
+
+    def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:
+        assert fitted.problem is not None
+        reason, value, limit = fitted.problem
+        board = self._boards[fitted.candidate.key].id
+        return Rejection(
+            stamp_ns, "markers", f"{self._name} {board} marker {fitted.candidate.marker}", reason, value, limit
+        )
+
+    def _unknown(self, stamp_ns: int, unknown: list[Candidate]) -> Rejection:
+        ids = ", ".join(f"{d.removeprefix('DICT_')}:{i}" for d, i in sorted({c.key for c in unknown}))
+        return Rejection(
+            stamp_ns, "markers", f"{self._name} ids {ids}", "ids that the rig does not know, number", len(unknown), 0
+        )
+
+
+def _is_pinhole(camera: CameraModel) -> bool:
+    fisheye = camera.distortion_model in ("equidistant", "fisheye")
+    return not fisheye and (camera.distortion_model in ("none", "") or not np.any(camera.D))
+
+
+def _judged(candidate: Candidate, start: Float, fit: PatternFit, k: int, cells: int, min_correlation: float) -> _Fitted:
+    corners, covariance = fit.corners[k], fit.covariance[k]
+    cell = np.sqrt(max(cv2.contourArea(start.astype(np.float32)), 1.0)) / cells
+    sigma = float(np.sqrt(max(np.diag(covariance).max(), 0.0))) / cell
+    moved = float(np.abs(corners - start).max()) / cell
+    problem: tuple[str, float, float] | None = None
+    if not np.isfinite(corners).all() or not np.isfinite(covariance).all() or sigma > _MAX_SIGMA_CELLS:
+        problem = ("corner sigma in cells", sigma, _MAX_SIGMA_CELLS)
+    elif fit.contrast[k] < _MIN_CONTRAST:
+        problem = ("contrast in grey values", float(fit.contrast[k]), _MIN_CONTRAST)
+    elif fit.correlation[k] < min_correlation:
+        problem = ("correlation with the pattern", float(fit.correlation[k]), min_correlation)
+    elif fit.share[k] < _MIN_SHARE:
+        problem = ("share of the edges that fit", float(fit.share[k]), _MIN_SHARE)
+    elif fit.last_step_px[k] > _SETTLED_PX:
+        problem = ("the fit did not settle, last step in px", float(fit.last_step_px[k]), _SETTLED_PX)
+    elif moved > 1.5:
+        problem = ("the fit left the marker, move in cells", moved, 1.5)
+    return _Fitted(candidate, corners, covariance, float(fit.correlation[k]), float(fit.contrast[k]), problem)
+
+
+def _refused(fitted: _Fitted, reason: str, value: float, limit: float) -> _Fitted:
+    return _Fitted(
+        fitted.candidate,
+        fitted.corners,
+        fitted.covariance,
+        fitted.correlation,
+        fitted.contrast,
+        (reason, float(value), float(limit)),
+    )
+
+
+def _distinct(fitted: list[_Fitted]) -> list[_Fitted]:
+    """Fits at different places; of those that ended at the same one, the best."""
+    result: list[_Fitted] = []
+    for f in sorted(fitted, key=lambda f: -f.correlation):
+        if all(np.abs(f.corners.mean(0) - g.corners.mean(0)).max() > 2.0 for g in result):
+            result.append(f)
+    return result

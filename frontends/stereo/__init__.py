@@ -1,0 +1,1 @@
+"""Stereo odometry front end: tracks with covariances, keyframes, motion and places seen again."""

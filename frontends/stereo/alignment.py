@@ -1,0 +1,232 @@
+"""Sub-pixel alignment of patches with their reference: inverse compositional, all patches at once.
+
+Each patch is normalised to zero mean and unit variance, so that gain and bias of the brightness drop out; the warp's
+linear part is given (it follows from the motion), the shift is estimated (Baker and Matthews, Lucas-Kanade 20 years
+on, 2004, section 3.2; the projection against mean and template is the forward additive ECC step of Evangelidis and
+Psarakis 2008 turned round).
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .flow import inside
+
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bool = NDArray[np.bool_]
+
+
+_CONVERGED_PX = 0.01
+"""A patch that still moves more than this after the last step is given up: those that creep are the bad ones."""
+_LONGEST_STEP_PX = 1.5
+_LARGEST_BEND = 0.4
+
+
+@dataclass(slots=True)
+class Patches:
+    """Reference patches of n tracks with `m` samples each."""
+
+    values: Float32
+    """Shape (n, m), normalised."""
+    steps: Float32
+    """Shape (n, k, m), k = 2 or 6: shift in the reference's pixels per normalised difference."""
+    prior: Float
+    """Shape (n, k, k): share of the step that pulls a bent warp back to the given one."""
+    inverse_hessian: Float
+    """Shape (n, 2, 2): covariance of the shift for unit variance of the raw difference, px^2 per grey value^2."""
+    contrast: Float
+    """Shape (n,), standard deviation of the patch in grey values."""
+
+    def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
+        """The patches at the given indices or of the given mask."""
+        return Patches(
+            self.values[index], self.steps[index], self.prior[index], self.inverse_hessian[index], self.contrast[index]
+        )
+
+    def append(self, other: "Patches") -> "Patches":
+        """These patches followed by others."""
+        return Patches(
+            np.concatenate((self.values, other.values)),
+            np.concatenate((self.steps, other.steps)),
+            np.concatenate((self.prior, other.prior)),
+            np.concatenate((self.inverse_hessian, other.inverse_hessian)),
+            np.concatenate((self.contrast, other.contrast)),
+        )
+
+    def put(self, mask: Bool, other: "Patches") -> None:
+        """Replaces the patches of `mask` (n,) by others."""
+        self.values[mask] = other.values
+        self.steps[mask] = other.steps
+        self.prior[mask] = other.prior
+        self.inverse_hessian[mask] = other.inverse_hessian
+        self.contrast[mask] = other.contrast
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Where the patches are, and how well they fit."""
+
+    px: Float
+    """Shape (n, 2)."""
+    correlation: Float
+    """Shape (n,), normalised cross correlation at `px`; -1 where the patch left the image."""
+    covariance: Float
+    """Shape (n, 2, 2): of `px`, from the patch's structure and the residual, px^2, not yet calibrated."""
+    converged: Bool
+    """Shape (n,)."""
+
+
+class PatchGrid:
+    """Sample places and weights of a square patch.
+
+    Args:
+        radius: samples to each side of the middle.
+        spacing_px: between samples.
+        bend_sigma: standard deviation of the warp's linear part about the given one; 0 estimates the shift alone.
+    """
+
+    def __init__(self, radius: int, spacing_px: float = 1.0, bend_sigma: float = 0.0) -> None:
+        self.affine = bend_sigma > 0
+        axis = np.arange(-radius, radius + 1, dtype=np.float64) * spacing_px
+        u, v = np.meshgrid(axis, axis)
+        self.offsets = np.stack((u.ravel(), v.ravel()), axis=1)
+        weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
+        self.weights = (weights / weights.sum()).astype(np.float32)
+        """Shape (m,). Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
+        self._stiffness = float((self.weights**2).sum()) / bend_sigma**2 if self.affine else 0.0
+        self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
+
+    def sample(self, image: Float32, px: Float, linear: Float | None = None) -> Float32:
+        """Grey values (n, m) at `px + linear @ offset`; `linear` (n, 2, 2) or None for the identity."""
+        shifts = self._shifts[None] if linear is None else linear.astype(np.float32) @ self._shifts
+        start = np.where(np.isfinite(px), px, -10.0).astype(np.float32)
+        u = start[:, 0, None] + shifts[:, 0]
+        v = start[:, 1, None] + shifts[:, 1]
+        return _float32(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+    def jacobian(self, gradient: Float32) -> Float32:
+        """Derivatives (n, k, m) by shift and, where it is estimated, linear part (row by row), from (n, 2, m)."""
+        if not self.affine:
+            return gradient
+        u, v = self._shifts
+        along_u, along_v = gradient[:, :1], gradient[:, 1:]
+        return np.concatenate((gradient, along_u * u, along_u * v, along_v * u, along_v * v), axis=1)
+
+    def prior(self, variance: Float) -> Float:
+        """Information (n, k, k) on the linear part, for a noise variance (n,) of normalised samples."""
+        weight = np.clip(variance * self._stiffness, 2e-3, 2.0) if self.affine else np.zeros(len(variance))
+        size = 6 if self.affine else 2
+        return weight[:, None, None] * np.diag(np.repeat((0.0, 1.0), (2, size - 2)))
+
+    def normalise(self, values: Float32) -> tuple[Float32, Float32]:
+        """Zero mean, unit variance under the weights; and the standard deviation (n,)."""
+        centred = values - (values @ self.weights)[:, None]
+        deviation = np.sqrt(np.maximum((centred * centred) @ self.weights, 1e-6))
+        centred /= deviation[:, None]
+        return centred, deviation
+
+
+def no_patches(grid: PatchGrid) -> Patches:
+    """No patch at all."""
+    m = len(grid.weights)
+    k = 6 if grid.affine else 2
+    return Patches(
+        np.zeros((0, m), np.float32),
+        np.zeros((0, k, m), np.float32),
+        np.zeros((0, k, k)),
+        np.zeros((0, 2, 2)),
+        np.zeros(0),
+    )
+
+
+def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
+    """Reference patches (n) about `px` (n, 2) of a smoothed image.
+
+    `variance` is that expected between a patch and its reference, in squared grey values: it weighs the linear part's
+    prior.
+    """
+    if len(px) == 0:
+        return no_patches(grid)
+    values, deviation = grid.normalise(grid.sample(image, px))
+    shift = np.array([[0.5, 0.0], [0.0, 0.5]])
+    gradient = np.stack(
+        [grid.sample(image, px + step) - grid.sample(image, px - step) for step in shift],
+        axis=1,
+    )
+    gradient /= deviation[:, None, None]
+    gradient -= (gradient @ grid.weights)[:, :, None]
+    along = (gradient @ (values * grid.weights)[:, :, None])[:, :, 0]
+    gradient -= along[:, :, None] * values[:, None, :]
+    jacobian = grid.jacobian(gradient)
+    weighted = jacobian * grid.weights
+    hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
+    prior = grid.prior(variance / deviation.astype(np.float64) ** 2)
+    inverse = np.linalg.inv(hessian + prior + 1e-9 * np.eye(hessian.shape[1]))
+    steps = inverse.astype(np.float32) @ weighted
+    spread = (steps[:, :2] @ steps[:, :2].transpose(0, 2, 1)).astype(np.float64)
+    spread /= (deviation.astype(np.float64) ** 2)[:, None, None]
+    return Patches(values, steps, inverse @ prior, spread, deviation.astype(np.float64))
+
+
+def align(
+    image: Float32,
+    patches: Patches,
+    guess: Float,
+    linear: Float,
+    grid: PatchGrid,
+    iterations: int = 6,
+    reach_px: float = 3.0,
+) -> Alignment:
+    """Places (n, 2) in a smoothed image where the reference patches fit best, near `guess` (n, 2).
+
+    Args:
+        image: smoothed grey image (h, w).
+        patches: n reference patches.
+        guess: start (n, 2); NaN gives no alignment.
+        linear: (n, 2, 2), derivative of this image's pixels by the reference's.
+        grid: the grid that the patches were made with.
+        iterations: upper limit of Gauss-Newton steps.
+        reach_px: a patch that went farther from its guess has not converged.
+    """
+    px = guess.copy()
+    n = len(px)
+    if n == 0:
+        return Alignment(px, np.zeros(0), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
+    size = patches.steps.shape[1]
+    bend = np.zeros((n, size))
+    active = np.ones(n, dtype=bool)
+    difference = np.zeros_like(patches.values)
+    warp = np.array(linear)
+    for _ in range(iterations):
+        # A slice where all are active: copies of all steps would cost more than the steps themselves.
+        index = slice(None) if active.all() else np.flatnonzero(active)
+        values, _ = grid.normalise(grid.sample(image, px[index], warp[index]))
+        difference[index] = values - patches.values[index]
+        move = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0].astype(np.float64)
+        if grid.affine:
+            move += (patches.prior[index] @ bend[index][:, :, None])[:, :, 0]
+        length = np.linalg.norm(move[:, :2], axis=1)
+        move *= np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-9))[:, None]
+        if grid.affine:
+            bend[index, 2:] = np.clip(bend[index, 2:] - move[:, 2:], -_LARGEST_BEND, _LARGEST_BEND)
+            warp[index] = linear[index] @ (np.eye(2) + bend[index, 2:].reshape(-1, 2, 2))
+        px[index] -= (warp[index] @ move[:, :2, None])[:, :, 0]
+        active[index] = length > _CONVERGED_PX
+        if not active.any():
+            break
+    mean_square = (difference**2) @ grid.weights
+    visible = inside(px, image.shape, 2.0)
+    correlation = np.where(visible, 1.0 - 0.5 * mean_square, -1.0)
+    raw_variance = mean_square * patches.contrast**2
+    covariance = raw_variance[:, None, None] * (linear @ patches.inverse_hessian @ linear.transpose(0, 2, 1))
+    moved = np.linalg.norm(px - guess, axis=1)
+    converged = visible & ~active & (moved < reach_px)
+    return Alignment(px, correlation, covariance.astype(np.float64), converged)
+
+
+def _float32(image: object) -> Float32:
+    """OpenCV's type stubs know no element type."""
+    return np.asarray(image, dtype=np.float32)

@@ -1,0 +1,351 @@
+"""The stereo front end: one pair in, one `StereoFrame` out."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...factors.camera import CameraModel
+from ...factors.measurements import StereoFrame
+from ..undistort import distort, undistort
+from . import points
+from .detection import detect
+from .flow import checked_flow, inside
+from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, project, transform
+from .keyframes import keyframe_reason
+from .landmarks import LandmarkStore
+from .motion import Motion, estimate_motion
+from .noise import NoiseModel
+from .observer import Keyview, Observer, expected_depth
+from .pair import StereoPair, prepare
+from .places import PlaceStore, Relocalisation
+from .revisit import revisit
+from .settings import StereoSettings
+from .sighting import Sighting, nothing_seen
+from .tracks import Int, Tracks, no_tracks
+from .vertical import VerticalCorrection
+
+Bool = NDArray[np.bool_]
+
+
+class StereoFrontEnd:
+    """Tracks, keyframes and a first-guess motion from stereo pairs in the order of their time.
+
+    Its own *chain* of motions starts at the first pair; it serves to predict where things are, not as an estimate.
+
+    Args:
+        left: left camera.
+        right: right camera.
+        m_left_T_m_right: (4, 4), nominal pose of the right camera in the left one; 2 % and half a pixel off do.
+        settings: thresholds.
+    """
+
+    def __init__(
+        self, left: CameraModel, right: CameraModel, m_left_T_m_right: Float, settings: StereoSettings | None = None
+    ) -> None:
+        self.settings = settings or StereoSettings()
+        self.rig = StereoGeometry(left, right, m_left_T_m_right)
+        self.landmarks = LandmarkStore(self.settings.store_landmarks)
+        self.places = PlaceStore(self.settings.store_keyframes, self.rig)
+        self._diagonal = float(np.hypot(left.width, left.height))
+        self._noise = NoiseModel()
+        self._vertical = VerticalCorrection(self.rig)
+        self._observer = Observer(self.rig, self._noise, self.settings)
+        self._tracks: Tracks = no_tracks(self._observer.grid)
+        self._last: StereoPair | None = None
+        self._view: Keyview | None = None
+        self._keyframe_count = 0
+        self._next_id = 0
+        self._chain_T_keyframe = np.eye(4)
+        self._keyframe_T_last = np.eye(4)
+        self._velocity = np.zeros(6)
+
+    @property
+    def chain_T_keyframe(self) -> Float:
+        """Shape (4, 4): the last keyframe's pose in the front end's own chain, corrected where places come back."""
+        return self._chain_T_keyframe.copy()
+
+    def process(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> StereoFrame:
+        """Tracks the features into this pair.
+
+        Args:
+            stamp_ns: time of the pair, later than that of the pair before.
+            left: image (h, w) or (h, w, 3), 8 bit.
+            right: the same size.
+        """
+        pair = prepare(stamp_ns, left, right)
+        if self._last is None:
+            self._last = pair
+            return self._restart(pair, np.eye(4), lost=False)
+        guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
+        self._track(self._last, pair, guess)
+        motion = self._motion_of_flow(guess)
+        if motion is None:
+            return self._recover(pair, guess)
+        pose = motion.reference_T_this
+        if self._wants_keyframe(pose) is None:
+            return self._plain_frame(pair, motion)
+        return self._keyframe(pair, pose) or self._recover(pair, pose)
+
+    def relocalise(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> list[Relocalisation]:
+        """Remembered keyframes that show the same place as this pair, the best first; changes nothing.
+
+        `process` calls the same search by itself when the tracks break.
+        """
+        return self.places.find(prepare(stamp_ns, left, right).left, self.settings.min_relocalisation)
+
+    def match_landmarks(self, ids: Int, points_m: Float) -> tuple[Int, Sighting]:
+        """Looks for old landmarks in the last keyframe's images, near where an estimate expects them.
+
+        What is found lives on as tracks under the old ids. Finds that do not agree with one common motion are not
+        accepted, and fewer than six never are.
+
+        Args:
+            ids: (n,), track ids of old; those that live, and those that the store does not know, are skipped.
+            points_m: (n, 3), expected places in the last keyframe's left camera.
+
+        Returns:
+            ids (k,) and their sighting in the last keyframe.
+        """
+        if self._view is None:
+            return np.zeros(0, dtype=np.int64), nothing_seen()
+        places = dict(zip(ids.tolist(), points_m, strict=True))
+        rows = self.landmarks.rows_of(np.array(sorted(places), dtype=np.int64))
+        expected = np.array([places[i] for i in self.landmarks.ids[rows].tolist()]).reshape(-1, 3)
+        self.landmarks.points[rows] = transform(self._chain_T_keyframe, expected)
+        tracks, sighting, _ = self._revisit(self._view, rows)
+        if self._last is not self._view.pair:
+            # The flow goes on from the last image, where these features have not been looked for.
+            self.landmarks.add(tracks, self._chain_T_keyframe)
+            return tracks.ids, sighting
+        self._tracks.extend(tracks)
+        return tracks.ids.copy(), sighting
+
+    # -- frame to frame ------------------------------------------------------------------------------------------
+
+    def _predicted_motion(self, stamp_ns: int) -> Float:
+        """`last_T_this` at constant velocity, for half a second at most."""
+        assert self._last is not None
+        return exponential(self._velocity * min((stamp_ns - self._last.stamp_ns) * 1e-9, 0.5))
+
+    def _track(self, last: StereoPair, pair: StereoPair, guess: Float) -> None:
+        """Flow from the last left image into this one; what does not come back ends."""
+        tracks, settings = self._tracks, self.settings
+        found, good = checked_flow(
+            last.left_as_bright_as(pair),
+            pair.left,
+            tracks.raw_px,
+            self._flow_guess(guess),
+            settings.flow_window_px,
+            settings.pyramid_levels,
+            settings.forward_backward_px,
+        )
+        tracks.raw_px = np.where(good[:, None], found, tracks.raw_px)
+        self._end(~(good & inside(found, pair.left.shape, 3.0)))
+
+    def _end(self, mask: Bool) -> None:
+        """Ends tracks that are out of sight; they may come back."""
+        if mask.any():
+            self.landmarks.add(self._tracks.take(mask), self._chain_T_keyframe)
+            self._tracks.keep(~mask)
+
+    def _flow_guess(self, guess: Float) -> Float:
+        """Expected raw pixels: points move with the camera, the rest as the median of them."""
+        tracks, camera = self._tracks, self.rig.left
+        before = distort(camera, project(transform(inverse(self._keyframe_T_last), tracks.points), camera))
+        after = distort(camera, project(transform(inverse(guess), tracks.points), camera))
+        shift = after - before
+        known = np.isfinite(shift).all(axis=1)
+        shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
+        return tracks.raw_px + np.clip(shift, -0.3 * self._diagonal, 0.3 * self._diagonal)
+
+    def _motion_of_flow(self, guess: Float) -> Motion | None:
+        """Motion since the last keyframe from left pixels as the flow leaves them."""
+        left_px = undistort(self.rig.left, self._tracks.raw_px)[0]
+        px = np.hstack((left_px, np.full_like(left_px, np.nan)))
+        covariance = np.broadcast_to(self._noise.flow_variance * np.eye(4), (len(px), 4, 4))
+        motion = self._robust_motion(px, covariance, guess)
+        if motion is not None:
+            self._noise.learn_flow(motion.chi2[np.isfinite(motion.chi2)])
+        return motion
+
+    def _robust_motion(self, px: Float, covariance: Float, guess: Float) -> Motion | None:
+        """Motion since the last keyframe; tracks that do not follow it get strikes. None without a sound consensus."""
+        tracks = self._tracks
+        usable = np.isfinite(tracks.points).all(axis=1) & np.isfinite(px[:, :2]).all(axis=1)
+        motion = estimate_motion(
+            tracks.points[usable],
+            tracks.points_covariance[usable],
+            px[usable],
+            covariance[usable],
+            (guess, self._keyframe_T_last),
+            self.rig,
+            self.settings.min_inliers,
+        )
+        if motion is None or not self._well_spread(px[usable][motion.inliers, :2]):
+            return None
+        strikes = np.zeros(len(tracks), dtype=np.int64)
+        strikes[usable] = np.where(motion.inliers, 0, 1 + (motion.chi2 > 60.0))
+        tracks.strikes = np.where(strikes > 0, tracks.strikes + strikes, 0)
+        inliers = np.zeros(len(tracks), dtype=bool)
+        inliers[usable] = motion.inliers
+        chi2 = np.full(len(tracks), np.nan)
+        chi2[usable] = motion.chi2
+        return Motion(motion.reference_T_this, inliers, chi2)
+
+    def _well_spread(self, px: Float) -> bool:
+        """Inliers in one corner or on one line hold the pose badly."""
+        spread = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(px.T))[0]), 0.0))
+        return spread > self.settings.min_spread * self._diagonal
+
+    def _wants_keyframe(self, pose: Float) -> str | None:
+        flow = undistort(self.rig.left, self._tracks.raw_px)[0] - self._tracks.keyframe_px
+        flow = flow[np.isfinite(flow).all(axis=1)]
+        return keyframe_reason(flow, pose, len(self._tracks), self._keyframe_count, self._diagonal, self.settings)
+
+    def _advance(self, pair: StereoPair, keyframe_T_this: Float) -> Float:
+        """Makes this pair the last one; `last_T_this`."""
+        assert self._last is not None
+        last_T_this = inverse(self._keyframe_T_last) @ keyframe_T_this
+        self._velocity = logarithm(last_T_this) / max((pair.stamp_ns - self._last.stamp_ns) * 1e-9, 1e-3)
+        self._keyframe_T_last = keyframe_T_this
+        self._last = pair
+        return last_T_this
+
+    def _plain_frame(self, pair: StereoPair, motion: Motion) -> StereoFrame:
+        tracks = self._tracks
+        left_px = undistort(self.rig.left, tracks.raw_px)[0]
+        n = len(tracks)
+        frame = StereoFrame(
+            stamp_ns=pair.stamp_ns,
+            is_keyframe=False,
+            track_ids=tracks.ids.copy(),
+            left_px=left_px,
+            left_covariance_px2=np.tile(self._noise.flow_variance * np.eye(2), (n, 1, 1)),
+            right_px=np.full((n, 2), np.nan),
+            right_covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+            last_T_this=self._advance(pair, motion.reference_T_this),
+            motion_inliers=int(motion.inliers.sum()),
+        )
+        tracks.keep((tracks.strikes < 3) & np.isfinite(left_px).all(axis=1))
+        return frame
+
+    # -- keyframes -----------------------------------------------------------------------------------------------
+
+    def _keyframe(self, pair: StereoPair, pose: Float) -> StereoFrame | None:
+        """Aligns all tracks with their reference, repeats the motion with both images, and fills up with new tracks."""
+        view = self._observer.view(pair)
+        sighting = self._observe(view, pose)
+        tracks = self._tracks
+        px = np.hstack((sighting.left_px, self._vertical.apply(sighting.left_px, sighting.right_px)))
+        motion = self._robust_motion(px, sighting.covariance, pose)
+        if motion is None:
+            return None
+        known = np.isfinite(motion.chi2)
+        growth = self._noise.learn_motion(motion.chi2[known], np.isfinite(px[known, 2]))
+        agree = (motion.inliers | ~known) & (tracks.strikes < 2)
+        tracks.keep(agree)
+        sighting = sighting.take(agree).scaled(growth)
+        last_T_this = self._advance(pair, motion.reference_T_this)
+        points.carry(tracks, motion.reference_T_this)
+        self._chain_T_keyframe = self._chain_T_keyframe @ motion.reference_T_this
+        self._keyframe_T_last = np.eye(4)
+        tracks.keyframe_px = sighting.left_px
+        tracks.ages += 1
+        points.measure(tracks, sighting, self._chain_T_keyframe, self.rig, self._vertical)
+        return self._fill(view, sighting, last_T_this, int(motion.inliers.sum()), lost=False)
+
+    def _observe(self, view: Keyview, pose: Float) -> Sighting:
+        """The living tracks in a keyframe's images; those that look different now end."""
+        tracks = self._tracks
+        sighting, raw_px, seen = self._observer.observe(
+            view, tracks, self._chain_T_keyframe @ pose, expected_depth(tracks, pose), tracks.right_offset_px
+        )
+        tracks.raw_px = np.where(seen[:, None], raw_px, tracks.raw_px)
+        self._end(~seen)
+        return sighting.take(seen)
+
+    def _fill(self, view: Keyview, sighting: Sighting, last_T_this: Float, inliers: int, lost: bool) -> StereoFrame:
+        """Adds landmarks seen again and new corners, and delivers the keyframe."""
+        settings, tracks = self.settings, self._tracks
+        rows = self.landmarks.in_view(self._chain_T_keyframe, self.rig, settings.revisits)
+        found, seen, correction = self._revisit(view, rows.rows)
+        self._correct_chain(correction)
+        free = _apart(tracks.raw_px, found.raw_px, 0.4 * self._spacing)
+        tracks.keep(free)
+        sighting = sighting.take(free).append(seen)
+        tracks.extend(found)
+        corners = detect(
+            view.pair.left,
+            tracks.raw_px,
+            settings.max_tracks - len(tracks),
+            self._spacing,
+            settings.patch_radius_px + 2,
+            view.pair.noise,
+        )
+        new, seen = self._observer.begin(view, corners, self._next_id, self._chain_T_keyframe)
+        self._next_id += len(new)
+        points.measure(new, seen, self._chain_T_keyframe, self.rig, self._vertical)
+        tracks.extend(new)
+        return self._deliver(view, sighting.append(seen), last_T_this, inliers, lost)
+
+    @property
+    def _spacing(self) -> float:
+        """Least distance between features; grows with the image."""
+        return self.settings.min_distance_px * self._diagonal / 432.7
+
+    def _revisit(self, view: Keyview, rows: NDArray[np.intp]) -> tuple[Tracks, Sighting, Float]:
+        return revisit(
+            view, self.landmarks, rows, self._chain_T_keyframe, self._observer, self.rig, self._vertical, self.settings
+        )
+
+    def _correct_chain(self, this_T_corrected: Float) -> None:
+        """Takes up the drift that landmarks seen again show; the points of living tracks are relative and stay."""
+        self._chain_T_keyframe = self._chain_T_keyframe @ this_T_corrected
+
+    def _deliver(self, view: Keyview, sighting: Sighting, last_T_this: Float, inliers: int, lost: bool) -> StereoFrame:
+        tracks = self._tracks
+        self._view = view
+        self._keyframe_count = len(tracks)
+        variance = sighting.left_covariance[:, 1, 1] + sighting.right_covariance[:, 1, 1]
+        self._vertical.learn(sighting.left_px, sighting.right_px, variance)
+        pair = view.pair
+        self.places.add(pair.stamp_ns, self._chain_T_keyframe, pair.left, tracks.ids, tracks.raw_px, tracks.points)
+        return StereoFrame(
+            stamp_ns=pair.stamp_ns,
+            is_keyframe=True,
+            track_ids=tracks.ids.copy(),
+            left_px=sighting.left_px,
+            left_covariance_px2=sighting.left_covariance,
+            right_px=sighting.right_px,
+            right_covariance_px2=sighting.right_covariance,
+            last_T_this=last_T_this,
+            motion_inliers=inliers,
+            lost=lost,
+        )
+
+    # -- losing and finding --------------------------------------------------------------------------------------
+
+    def _recover(self, pair: StereoPair, guess: Float) -> StereoFrame:
+        """The tracks do not connect: goes on from a remembered place, or from where constant velocity leads to."""
+        last_T_this = inverse(self._keyframe_T_last) @ guess
+        self._end(np.ones(len(self._tracks), dtype=bool))
+        found = self.places.find(pair.left, self.settings.min_relocalisation)
+        if found:
+            chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
+            last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
+        self._velocity = np.zeros(6)
+        return self._restart(pair, last_T_this, lost=True)
+
+    def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
+        """A keyframe without living tracks."""
+        self._chain_T_keyframe = self._chain_T_keyframe @ self._keyframe_T_last @ last_T_this
+        self._keyframe_T_last = np.eye(4)
+        self._tracks = no_tracks(self._observer.grid)
+        self._last = pair
+        return self._fill(self._observer.view(pair), nothing_seen(), last_T_this, 0, lost)
+
+
+def _apart(px: Float, others: Float, distance_px: float) -> Bool:
+    """Which of px (n, 2) keep a distance from all others (m, 2)."""
+    if len(others) == 0:
+        return np.ones(len(px), dtype=bool)
+    return (np.linalg.norm(px[:, None] - others[None], axis=2) > distance_px).all(axis=1)

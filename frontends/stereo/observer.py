@@ -1,0 +1,121 @@
+"""Sub-pixel observations of tracks in a keyframe's two images."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..undistort import distort, undistort
+from .alignment import Alignment, Patches, PatchGrid, align, make_patches
+from .geometry import Float, StereoGeometry, inverse, project, rays, transform
+from .images import Float32
+from .landmarks import CROP_GRID, crops
+from .matching import search_right
+from .noise import NoiseModel
+from .pair import StereoPair
+from .settings import StereoSettings
+from .sighting import Sighting
+from .tracks import Int, Tracks, new_tracks
+from .warp import linear_warps
+
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Keyview:
+    """A keyframe's pair with its smoothed images."""
+
+    pair: StereoPair
+    left: Float32
+    right: Float32
+
+
+class Observer:
+    """Aligns patches in left and right images and gives each place its covariance."""
+
+    def __init__(self, rig: StereoGeometry, noise: NoiseModel, settings: StereoSettings) -> None:
+        self._rig, self._noise, self._settings = rig, noise, settings
+        self.grid = PatchGrid(settings.patch_radius_px, bend_sigma=settings.bend_sigma)
+
+    def view(self, pair: StereoPair) -> Keyview:
+        """The pair with its smoothed images."""
+        return Keyview(pair, *pair.smooth(self._settings.smoothing_px))
+
+    def mismatch(self, view: Keyview) -> float:
+        """Expected variance between a patch and its reference, in squared grey values."""
+        return self._noise.mismatch(view.pair.noise)
+
+    def accepts(self, alignment: Alignment) -> Bool:
+        """Which patches look like their reference."""
+        return alignment.converged & (alignment.correlation > self._settings.min_correlation)
+
+    def observe(
+        self, view: Keyview, tracks: Tracks, chain_T_this: Float, depth_m: Float, right_offset_px: Float
+    ) -> tuple[Sighting, Float, Bool]:
+        """Observations of tracks near their `raw_px`.
+
+        Args:
+            view: the keyframe.
+            tracks: n tracks.
+            chain_T_this: (4, 4), expected pose of the camera in the chain.
+            depth_m: (n,), expected depth; NaN gives no right match.
+            right_offset_px: (n, 2), expected disagreement of the right match with the nominal rig.
+
+        Returns:
+            the sighting, refined left raw pixels (n, 2), and which tracks were seen in the left image (n,).
+        """
+        warps = linear_warps(tracks.patch_points, inverse(chain_T_this) @ tracks.patch_poses, self._rig)
+        left = align(view.left, tracks.patches, tracks.raw_px, warps[0], self.grid)
+        left_px, left_covariance = undistort(self._rig.left, left.px, self._noise.aligned(left.covariance))
+        seen = self.accepts(left) & np.isfinite(left_px).all(axis=1)
+        # The left ray is known better than the expected one: keep the expected depth on it.
+        points = rays(left_px, self._rig.left) * depth_m[:, None]
+        start = distort(self._rig.right, project(self._rig.right_points(points), self._rig.right)) + right_offset_px
+        start[~seen] = np.nan
+        right = align(view.right, tracks.patches, start, warps[1], self.grid)
+        right_px, right_covariance = self._right(right)
+        assert left_covariance is not None
+        self._noise.learn_mismatch(left, tracks.patches, seen)
+        return Sighting(left_px, left_covariance, right_px, right_covariance), left.px, seen
+
+    def _right(self, right: Alignment) -> tuple[Float, Float]:
+        px, covariance = undistort(self._rig.right, right.px, self._noise.aligned(right.covariance))
+        px[~self.accepts(right)] = np.nan
+        assert covariance is not None
+        return px, covariance
+
+    def begin(self, view: Keyview, raw_px: Float, first_id: int, chain_T_this: Float) -> tuple[Tracks, Sighting]:
+        """New tracks at corners (n, 2) of the left image, with their right matches."""
+        settings = self._settings
+        ideal = undistort(self._rig.left, raw_px)[0]
+        valid = np.isfinite(ideal).all(axis=1)
+        raw_px, ideal = raw_px[valid], ideal[valid]
+        patches = make_patches(view.left, raw_px, self.grid, self.mismatch(view))
+        ids: Int = np.arange(first_id, first_id + len(raw_px), dtype=np.int64)
+        tracks = new_tracks(ids, raw_px, ideal, patches, crops(view.left, raw_px, CROP_GRID), chain_T_this)
+        start = search_right(
+            view.pair.left,
+            view.pair.right,
+            raw_px,
+            ideal,
+            self._rig,
+            settings.nearest_baselines * self._rig.baseline_m,
+            settings.epipolar_gate_px,
+            settings.patch_radius_px,
+            settings.min_correlation,
+        )
+        identity = np.broadcast_to(np.eye(2), (len(raw_px), 2, 2))
+        right = align(view.right, patches, start, identity, self.grid)
+        return tracks, self._first_sighting(ideal, raw_px, right, patches)
+
+    def _first_sighting(self, ideal: Float, raw_px: Float, right: Alignment, patches: Patches) -> Sighting:
+        right_px, right_covariance = self._right(right)
+        own = patches.inverse_hessian * self._noise.reference_variance(right, patches)[:, None, None]
+        left_covariance = undistort(self._rig.left, raw_px, self._noise.reference(own))[1]
+        assert left_covariance is not None
+        return Sighting(ideal, left_covariance, right_px, right_covariance)
+
+
+def expected_depth(tracks: Tracks, keyframe_T_this: Float) -> Float:
+    """Depth (n,) of the tracks' points in this camera."""
+    return transform(inverse(keyframe_T_this), tracks.points)[:, 2]

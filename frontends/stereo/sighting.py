@@ -1,0 +1,54 @@
+"""What one keyframe saw of its tracks."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Float, block_diagonal
+
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """n features in ideal pixels; right ones are NaN where there is no match."""
+
+    left_px: Float
+    """Shape (n, 2)."""
+    left_covariance: Float
+    """Shape (n, 2, 2)."""
+    right_px: Float
+    """Shape (n, 2)."""
+    right_covariance: Float
+    """Shape (n, 2, 2)."""
+
+    @property
+    def covariance(self) -> Float:
+        """Shape (n, 4, 4), left and right together."""
+        return block_diagonal(self.left_covariance, self.right_covariance)
+
+    def take(self, mask: NDArray[np.intp] | Bool) -> "Sighting":
+        """The features of a mask or index."""
+        return Sighting(
+            self.left_px[mask], self.left_covariance[mask], self.right_px[mask], self.right_covariance[mask]
+        )
+
+    def scaled(self, factor: float) -> "Sighting":
+        """The same with covariances multiplied by a factor."""
+        return Sighting(self.left_px, factor * self.left_covariance, self.right_px, factor * self.right_covariance)
+
+    def append(self, other: "Sighting") -> "Sighting":
+        """These features followed by others."""
+        return Sighting(
+            np.concatenate((self.left_px, other.left_px)),
+            np.concatenate((self.left_covariance, other.left_covariance)),
+            np.concatenate((self.right_px, other.right_px)),
+            np.concatenate((self.right_covariance, other.right_covariance)),
+        )
+
+
+def nothing_seen() -> Sighting:
+    """No feature."""
+    none, no_covariance = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    return Sighting(none, no_covariance, none, no_covariance)

@@ -1,0 +1,137 @@
+"""What a run at measurement level is made of: a scenario file (YAML), unknown keys are errors."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import Field, ValidationError
+
+from ..factors.errors import RigError
+from ..factors.rig import NonNegative, Positive, Section
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class Outliers(Section):
+    """Gross errors: which share of the measurements, and how large, uniform in direction and size up to `size`."""
+
+    share: Share = 0.0
+    families: tuple[Literal["tracks", "markers", "clouds", "picks", "outlines"], ...] = (
+        "tracks",
+        "markers",
+        "clouds",
+        "picks",
+        "outlines",
+    )
+    size_px: Positive = 30.0
+    size_m: Positive = 0.3
+
+
+class NoiseFactors(Section):
+    """True noise over stated noise, by family. 1: the models are right; 2: the estimator is told half of it."""
+
+    tracks: Positive = 1.0
+    markers: Positive = 1.0
+    clouds: Positive = 1.0
+    picks: Positive = 1.0
+    outlines: Positive = 1.0
+
+
+class Motion(Section):
+    """The mobile camera's way: in front of the board, round the panel, three places with the pipe in view."""
+
+    duration_s: Positive = 20.0
+    keyframe_rate_hz: Positive = 3.0
+    board_share: Annotated[float, Field(gt=0.0, lt=0.8)] = 0.3
+    """Share of the time spent before the board."""
+    style: Literal["smooth", "sharp"] = "smooth"
+    returns: bool = False
+    """The board is seen again at the end."""
+
+
+class Tracks(Section):
+    """Features of the mobile stereo pair."""
+
+    per_frame: Count = 80
+    sigma_px: Positive = 0.25
+    right_share: Share = 0.9
+    """Share of the features that are found in the right image too."""
+    mean_life_frames: Positive = 12.0
+    motion_sigma_m: NonNegative = 0.003
+    motion_sigma_rad: NonNegative = 0.0006
+    """Of the front end's motion from frame to frame: a first guess only."""
+
+
+class Markers(Section):
+    sigma_px: Positive = 0.12
+    smallest_side_px: Positive = 13.0
+
+
+class Clouds(Section):
+    """Kinect depth images. 0 frames: no Kinect."""
+
+    frames: Count = 6
+    points: Count = 400
+
+
+class Picks(Section):
+    """Operator clicks at each of the places on each of the two pipe points."""
+
+    places: Annotated[int, Field(ge=1, le=3)] = 3
+    clicks: Annotated[int, Field(ge=1)] = 2
+    sigma_px: Positive = 1.0
+    roles: tuple[Literal["grasp", "cut", "other"], ...] = ("grasp", "cut")
+    outlines: bool = True
+    """The pipe's two outline edges in the image of every click."""
+    outline_sigma_px: Positive = 0.3
+
+
+class Scenario(Section):
+    """One kind of run. Every run draws scene, faults of the rig, motion and noise anew from its seed."""
+
+    name: str = "cell"
+    text: str = ""
+    seed: int = 0
+    """Added to the seed of the run."""
+    width_px: Annotated[int, Field(ge=64)] = 360
+    height_px: Annotated[int, Field(ge=48)] = 240
+    focal_px: Positive = 270.0
+    baseline_m: Positive = 0.15
+    panel: bool = True
+    """A panel hides the pipe from the Kinect."""
+    motion: Motion = Motion()
+    tracks: Tracks = Tracks()
+    markers: Markers = Markers()
+    clouds: Clouds = Clouds()
+    picks: Picks = Picks()
+    noise_factors: NoiseFactors = NoiseFactors()
+    outliers: Outliers = Outliers()
+    faults: bool = True
+    """False: the rig is in truth exactly as its file says."""
+    typed_side_m: Positive | None = None
+    """Side length that the rig file gives when it is wrong; None: the right one."""
+    nominal_diameter: bool = True
+    """The rig file gives the pipe's diameter."""
+    rig: dict[str, object] = Field(default_factory=dict)
+    """Merged into the rig file of the runs, key by key."""
+
+
+def load_scenario(path: Path) -> Scenario:
+    """The scenario of a YAML file.
+
+    Raises:
+        RigError: the file cannot be read, is no YAML, or a key or value is wrong; names file and key.
+    """
+    try:
+        data = yaml.safe_load(path.read_bytes())
+    except OSError as error:
+        raise RigError(f"{path}: cannot be read ({error.strerror}); give a scenario file or name") from error
+    except yaml.YAMLError as error:
+        raise RigError(f"{path}: is no YAML ({' '.join(str(error).split())})") from error
+    try:
+        return Scenario.model_validate(data or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "scenario"
+        raise RigError(f"{path}: {where}: {first['msg']}") from error
