@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..estimator.baseline import ClickedPoint
 from ..factors.measurements import CloudFrame, OutlineSighting, Pick
 from ..factors.outline import outline_lines
 from .measurement_level_scene import cast, occluded
@@ -10,6 +11,8 @@ from .measurement_level_world import World, inside, project, spoil
 
 KINECT_FOCAL_PX = 585.0
 KINECT_SIZE = (640, 480)
+MATCH_SIGMA_PX = 0.25
+"""Disparity error of semi-global matching at a window's median."""
 
 
 def cloud_frames(world: World) -> list[CloudFrame]:
@@ -70,6 +73,32 @@ def clicks(world: World) -> list[Pick | OutlineSighting]:
                 outline = _outline(world, stamp_ns, w_T_m, pixels[0])
                 found += [outline] if outline is not None else []
     return found
+
+
+def stereo_clicks(world: World, picks: list[Pick]) -> list[ClickedPoint]:
+    """What a stereo matcher says under each click: the visible surface, with the calibration as given.
+
+    For the paper's chain only; the estimator is not given it.
+    """
+    return [_stereo_click(world, pick) for pick in picks]
+
+
+def _stereo_click(world: World, pick: Pick) -> ClickedPoint:
+    scenario, rng = world.scenario, world.rng
+    left, right = world.true.cameras["m_left"], world.true.cameras["m_right"]
+    w_T_m = world.w_T_m[world.stamps_ns.index(pick.stamp_ns)]
+    ray = w_T_m[:3, :3] @ np.linalg.solve(left.K, np.array([*pick.px, 1.0]))
+    distance, _, _ = cast(w_T_m[:3, 3], ray[None], world.scene)
+    if not np.isfinite(distance[0]):
+        return ClickedPoint(pick, None, "no surface under the click")
+    surface_w = w_T_m[:3, 3] + distance[0] * ray
+    seen, _ = project(right, w_T_m @ world.true.m_left_T_m_right, surface_w[None])
+    disparity_px = pick.px[0] - seen[0, 0] + rng.normal(0.0, MATCH_SIGMA_PX)
+    if disparity_px <= 0.5:
+        return ClickedPoint(pick, None, "no stereo depth at the click")
+    K = world.nominal["m_left"].K
+    depth_m = K[0, 0] * scenario.baseline_m / disparity_px
+    return ClickedPoint(pick, depth_m * np.linalg.solve(K, np.array([*pick.px, 1.0])))
 
 
 def _pick(world: World, stamp_ns: int, point_id: str, role: str, exact_px: Float) -> Pick:
