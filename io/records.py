@@ -28,6 +28,7 @@ _OTHER_LIMIT = 1 << 28
 _CHUNK_START = re.compile(rb"\x06.{5}\x00{3}", re.DOTALL)
 PARSE_ERRORS = (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError)
 _HEADER = 9
+_DATA_KINDS = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT, Opcode.METADATA}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +48,16 @@ class RecordStream:
 
     Args:
         size: bytes of the whole file, where known: a record that is longer than what is left is found at once.
+        with_crc: check the checksum over all records, where the writer gave one.
 
     Raises (while iterating):
         LogError: empty, or not an MCAP.
     """
 
-    def __init__(self, stream: BinaryIO, label: str, size: int | None = None) -> None:
+    def __init__(self, stream: BinaryIO, label: str, size: int | None = None, with_crc: bool = True) -> None:
         self.report = DamageReport(label)
-        self._bytes = ByteStream(stream)
+        self._bytes = ByteStream(stream, with_crc)
+        self._crc: int | None = None
         self._label = label
         self._size = size
 
@@ -63,6 +66,7 @@ class RecordStream:
         while (head := self._head()) is not None:
             opcode, length, offset = head
             if opcode == Opcode.DATA_END:
+                self._data_end(length)
                 return
             if not self._plausible(opcode, length):
                 self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt")
@@ -93,12 +97,19 @@ class RecordStream:
     def _head(self) -> tuple[int, int, int] | None:
         """Opcode, length and offset of the next record; None at the end of the stream."""
         offset = self._bytes.position
+        self._crc = self._bytes.crc
         data = self._bytes.read_up_to(_HEADER)
         if len(data) < _HEADER:
             self._add(Damage("cut", offset, len(data), "no end mark"))
             return None
         opcode, length = struct.unpack("<BQ", data)
         return opcode, length, offset
+
+    def _data_end(self, length: int) -> None:
+        body = self._bytes.read_up_to(min(length, 4))
+        expected = int.from_bytes(body, "little") if len(body) == 4 else 0
+        if expected and self._crc is not None and self._crc != expected and not self.report.places:
+            self.report.notes.append("the checksum over all records differs, so some message is wrong")
 
     def _plausible(self, opcode: int, length: int) -> bool:
         if opcode == 0 or length > _LIMITS.get(opcode, _OTHER_LIMIT):
@@ -146,6 +157,9 @@ class RecordStream:
             self.report.last_time_ns = max(log_time_ns, self.report.last_time_ns or 0)
             yield RawMessage(channel_id, log_time_ns, body[22:])
             return
+        if not _belongs(opcode, body):
+            self._add(Damage("corrupt", offset, len(body), f"a record of kind {opcode:#x} has no place here"))
+            return
         try:
             record = _parse(opcode, body)
         except PARSE_ERRORS as error:
@@ -187,6 +201,13 @@ class RecordStream:
 def head_bytes(opcode: int, length: int) -> bytes:
     """The nine bytes before a record."""
     return struct.pack("<BQ", opcode, length)
+
+
+def _belongs(opcode: int, body: memoryview) -> bool:
+    """Whether a record may stand before the end of the data: one whose kind was damaged mostly may not."""
+    if opcode == Opcode.MESSAGE_INDEX:
+        return len(body) >= 6 and len(body) >= 6 + struct.unpack_from("<I", body, 2)[0]
+    return opcode in _DATA_KINDS or opcode >= 0x80  # those belong to applications
 
 
 def _parse(opcode: int, body: memoryview) -> Record | None:

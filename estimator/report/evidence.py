@@ -34,7 +34,7 @@ def _consistency(result: Result) -> Iterator[Block]:
     if consistency.passed:
         yield Paragraph("Yes. Every family of measurements scatters as much as its stated uncertainty says.")
     else:
-        yield Paragraph("NO. " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
+        yield Paragraph("NO: " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
     if not consistency.by_family:
         return
     rows = tuple(
@@ -48,7 +48,7 @@ def _consistency(result: Result) -> Iterator[Block]:
         header=("Family", "chi²", "degrees of freedom", "ratio", "limits of the ratio", "residuals", "softened"),
         rows=(*rows, (*total, "", "", "")),
         numeric=(1, 2, 3, 4, 5, 6),
-        total=True,
+        total=1,
         widths=(0.28, 0.12, 0.14, 0.09, 0.15, 0.11, 0.11),
     )
     yield Drawing(

@@ -176,7 +176,7 @@ class StereoFrontEnd:
             tracks.points_covariance[usable],
             px[usable],
             covariance[usable],
-            guess,
+            (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
         )
@@ -240,10 +240,10 @@ class StereoFrontEnd:
         if motion is None:
             return None
         known = np.isfinite(motion.chi2)
-        self._noise.learn_motion(motion.chi2[known], np.isfinite(px[known, 2]))
+        growth = self._noise.learn_motion(motion.chi2[known], np.isfinite(px[known, 2]))
         agree = (motion.inliers | ~known) & (tracks.strikes < 2)
         tracks.keep(agree)
-        sighting = sighting.take(agree)
+        sighting = sighting.take(agree).scaled(growth)
         last_T_this = self._advance(pair, motion.reference_T_this)
         points.carry(tracks, motion.reference_T_this)
         self._chain_T_keyframe = self._chain_T_keyframe @ motion.reference_T_this

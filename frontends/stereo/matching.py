@@ -1,4 +1,4 @@
-"""Right match of new features: normalised correlation along the nominal epipolar line, with room for a rig that is off."""
+"""Right match of new features: correlation along the nominal epipolar line, with room for a rig that is off."""
 
 import cv2
 import numpy as np
@@ -53,7 +53,7 @@ def search_right(
 def _search(
     left: Image, right: Image, px: Float, far: Float, near: Float, gate: float, radius: int, min_correlation: float
 ) -> Float:
-    u, v = (int(round(value)) for value in px)
+    u, v = (round(value) for value in px.tolist())
     template = left[max(v - radius, 0) : v + radius + 1, max(u - radius, 0) : u + radius + 1]
     if template.shape != (2 * radius + 1, 2 * radius + 1):
         return np.full(2, np.nan)
