@@ -92,9 +92,7 @@ def outliers(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set
     return found
 
 
-def snooped(
-    log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[int]
-) -> list[tuple[int, Rejection]]:
+def snooped(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[int]) -> list[tuple[int, Rejection]]:
     """The worst measurement of each small family by Baarda's test, where it is beyond the limit.
 
     A wrong measurement that few others control pulls the estimate and hides its residual. Its standardised residual
@@ -112,6 +110,8 @@ def snooped(
             continue
         sigma = system.standardised(position)
         if sigma > SNOOPING_SIGMA and sigma > worst.get(record.family, (0.0,))[0]:
-            told = Rejection(record.stamp_ns, record.family, record.what, "off the rest by sigmas", sigma, SNOOPING_SIGMA)
+            told = Rejection(
+                record.stamp_ns, record.family, record.what, "off the rest by sigmas", sigma, SNOOPING_SIGMA
+            )
             worst[record.family] = (sigma, index, told)
     return [(index, told) for _, index, told in worst.values()]
