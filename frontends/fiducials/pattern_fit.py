@@ -309,7 +309,7 @@ def fit_patterns(
     patterns: list[Float],
     positions: Float | None = None,
     windows: Windows | None = None,
-    steps: int = 6,
+    steps: int = 8,
     blur_px: float = 1.2,
 ) -> PatternFit:
     """Corners of m markers with one pattern size, from near ones.
