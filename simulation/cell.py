@@ -15,7 +15,7 @@ from .page import page_texture
 from .rigid import inverse, looking, rigid, transform
 from .scenario import Scenario
 from .stage import Lamp
-from .surfaces import Body, Patch, Rectangle, Texture, Tube, box, rod
+from .surfaces import Body, Patch, Rectangle, Texture, Tube, across, box, rod
 
 Float = NDArray[np.float64]
 PLACES = {"A": (-0.45, 1.85), "B": (0.05, 1.45), "C": (0.40, 2.00)}
@@ -122,9 +122,7 @@ def _pipe(
 
 
 def _bolts(centre: Float, pipe: PipeTruth, radius_m: float, look: Texture) -> list[Patch]:
-    first = np.cross(pipe.axis, np.eye(3)[np.argmin(np.abs(pipe.axis))])
-    first /= np.linalg.norm(first)
-    second = np.cross(pipe.axis, first)
+    first, second = across(pipe.axis)
     patches = []
     for angle in np.arange(8) * np.pi / 4:
         place = centre + radius_m * (np.cos(angle) * first + np.sin(angle) * second)
@@ -145,8 +143,8 @@ def _panel(scenario: Scenario, pipe: PipeTruth, rng: np.random.Generator) -> lis
     if not scenario.pipe.hidden:
         return []
     share = 0.75 / pipe.at_height(1.1)[1]
-    reach = [pipe.at_height(z)[0] * share for z in (0.0, 2.0)]
-    left, right = min(reach) - 0.13 - pipe.radius_m, max(reach) + 0.13 + pipe.radius_m
+    reach = [pipe.at_height(z)[0] * share for z in (0.2, 1.9)]
+    left, right = min(reach) - 0.11 - pipe.radius_m, max(reach) + 0.11 + pipe.radius_m
     size = (right - left, 0.03, rng.uniform(1.9, 2.1))
     look = textures.plain(rng.uniform(0.45, 0.65), 0.008, 0.02)
     return [

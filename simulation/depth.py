@@ -33,7 +33,7 @@ def axial_sigma_m(z_m: Depth, angle_rad: Depth) -> Depth:
 def depth_directions(camera: CameraModel) -> NDArray[np.float32]:
     """Rays of the depth image, z = 1, shape (height * width, 3)."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    return directions(camera, np.stack([u.ravel(), v.ravel()], axis=1)).astype(np.float32)
+    return directions(camera, np.stack([u.ravel(), v.ravel()], axis=1).astype(float)).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def _shaded(view: View, rays: NDArray[np.float32], z: Depth, w_T_b: Float) -> ND
     """Where the projector, beside the camera, does not reach."""
     projector = (w_T_b[:3, 3] + BASELINE_M * w_T_b[:3, 0]).astype(np.float32)
     points = rays[:, :3] + (z * np.float32(0.998))[:, None] * rays[:, 3:]
-    back = np.concatenate([points, projector - points], axis=1)
+    back = np.concatenate([points, projector - points], axis=1).astype(np.float32)
     return view.blocked(back, 0.0, 0.97)
 
 

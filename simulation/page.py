@@ -43,7 +43,7 @@ def page_texture(
             _print(page, marker, (width_m, height_m), texel_m, dictionary)
         coarse = rng.standard_normal((9, 12)).astype(np.float32)
         shade = cv2.resize(coarse, (columns, rows), interpolation=cv2.INTER_CUBIC)
-        return page * (1 + 0.012 * shade)
+        return (page * (1 + 0.012 * shade)).astype(np.float32)
 
     return texture
 
@@ -76,4 +76,4 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
     """Cells of an upright marker with its border, 0 black, 255 white, shape (n, n)."""
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     count = known.markerSize + 2
-    return cv2.aruco.generateImageMarker(known, marker_id, count, borderBits=1)
+    return np.asarray(cv2.aruco.generateImageMarker(known, marker_id, count, borderBits=1), np.uint8)

@@ -16,13 +16,8 @@ from .surfaces import Body, Patch, Rectangle
 from .textures import brick, poster
 
 Float = NDArray[np.float64]
-# Sub-sample and share of the exposure: each place in the pixel sees its own moments, centred on the middle.
-_FOUR = ((0, -0.375), (3, -0.125), (1, 0.125), (2, 0.375))
-_EIGHT = tuple(
-    (place, sign * time)
-    for place, time in zip((0, 3, 1, 2), (0.4375, 0.3125, 0.1875, 0.0625), strict=True)
-    for sign in (-1, 1)
-)
+_ORDER = (0, 2, 3, 1)
+"""Of the four places in a pixel; 0 and 3, 1 and 2 lie opposite each other."""
 
 
 def render_light(
@@ -57,7 +52,13 @@ def _schedule(grid: RayGrid, w_T_camera: Callable[[float], Float], exposure_s: f
     blur_px = (turn + np.linalg.norm(end[:3, 3] - start[:3, 3]) / 1.5) / (2 * grid.spread)
     if blur_px < 0.15:
         return still
-    return _FOUR if blur_px < 2.5 else _EIGHT
+    return _spread(4 if blur_px < 1.5 else 8 if blur_px < 5 else 16)
+
+
+def _spread(count: int) -> tuple[tuple[int, float], ...]:
+    """Places in the pixel and shares of the exposure, point-symmetric in both, so that edges do not shift."""
+    first = [(_ORDER[k % 4], (k + 0.5) / count - 0.5) for k in range(count // 2)]
+    return (*first, *((3 - place, -share) for place, share in reversed(first)))
 
 
 def _rays(directions: NDArray[np.float32], w_T_camera: Float) -> NDArray[np.float32]:

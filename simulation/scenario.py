@@ -1,7 +1,8 @@
 """What to simulate, as a file: every key has a default, unknown keys are errors."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import Field, ValidationError, model_validator
@@ -174,6 +175,8 @@ class Scenario(Section):
     bias: Bias = Bias()
     timeline: Timeline = Timeline()
     picks: PickOptions = PickOptions()
+    detail: Annotated[float, Field(gt=0, le=4)] = 1.0
+    """Fineness of the textures (the page is always fine); lower starts faster, higher suits large images."""
 
     @model_validator(mode="after")
     def _long_enough(self) -> Self:
@@ -212,12 +215,28 @@ def load_scenarios(source: Path | str) -> list[Scenario]:
     try:
         return [Scenario.model_validate(_over(common, run)) for run in data.get("runs", [{}])]
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "scenario"
-        raise ScenarioError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from error
+        raise ScenarioError(f"{path}: {_first(error)}") from error
 
 
-def _over(common: dict, run: dict) -> dict:
+def override(scenario: Scenario, changes: Mapping[str, Any]) -> Scenario:
+    """The scenario with some keys changed, section by section.
+
+    Raises:
+        ScenarioError: a key or value is wrong.
+    """
+    try:
+        return Scenario.model_validate(_over(scenario.model_dump(), changes))
+    except ValidationError as error:
+        raise ScenarioError(f"scenario {scenario.name}: {_first(error)}") from error
+
+
+def _first(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"]) or "scenario"
+    return f"{where}: {first['msg'].removeprefix('Value error, ')}"
+
+
+def _over(common: Mapping[str, Any], run: Mapping[str, Any]) -> dict[str, Any]:
     """The common keys with those of one run laid over them, section by section."""
     merged = dict(common)
     for key, value in run.items():

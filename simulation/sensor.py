@@ -42,14 +42,14 @@ def directions(camera: CameraModel, pixels: Float) -> Float:
         flat = cv2.undistortPoints(pixels[:, None], camera.K, camera.D, criteria=criteria).reshape(-1, 2)
     else:
         flat = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    return np.concatenate([np.asarray(flat, dtype=float), np.ones((len(flat), 1))], axis=1)
 
 
 def project(camera: CameraModel, points: Float) -> Float:
     """Raw pixels (n, 2) of points (n, 3) in the camera's optical frame; NaN behind it."""
     points = np.asarray(points, dtype=float).reshape(-1, 3)
     pixels, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.K, camera.D)
-    return np.where(points[:, 2:] > 1e-6, pixels.reshape(-1, 2), np.nan)
+    return np.where(points[:, 2:] > 1e-6, np.asarray(pixels, dtype=float).reshape(-1, 2), np.nan)
 
 
 def expose(light: NDArray[np.float32], settings: Light, gain: float, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -59,7 +59,7 @@ def expose(light: NDArray[np.float32], settings: Light, gain: float, rng: np.ran
     scale 1.
     """
     if settings.blur_px > 0:
-        light = cv2.GaussianBlur(light, (0, 0), settings.blur_px)
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), settings.blur_px), np.float32)
     height, width = light.shape[:2]
     u = (np.arange(width) - (width - 1) / 2) / (width / 2)
     v = (np.arange(height) - (height - 1) / 2) / (width / 2)

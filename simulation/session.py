@@ -1,6 +1,5 @@
 """One recording before it is rendered: who stands and moves where, and when each camera looks."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,11 +119,6 @@ class Session:
         b_T_w = inverse(self.motion.kinect(time_s))
         return {point_id: transform(b_T_w, place) for point_id, (_, place) in self.cell.points.items()}
 
-    def stereo_times(self) -> Iterator[tuple[int, float]]:
-        """Number and time of each stereo frame."""
-        rate = self.scenario.mobile.rate_hz
-        yield from ((k, k / rate) for k in range(int(np.floor(self.scenario.duration_s * rate + 1e-6))))
-
 
 def prepare(scenario: Scenario, seed: int) -> Session:
     """Draw rig, cell and trajectory, bake the light, choose the images that the operator clicks in."""
@@ -132,7 +126,7 @@ def prepare(scenario: Scenario, seed: int) -> Session:
     rig = draw_rig(scenario, side, generator(seed, 1))
     cell = build_cell(scenario, rig.truth, side, generator(seed, 2))
     motion = Motion(scenario, cell, _stations(side, generator(seed, 3)))
-    stage = build_stage(cell.bodies, cell.lamps, motion.poses(0.0), generator(seed, 4))
+    stage = build_stage(cell.bodies, cell.lamps, motion.poses(0.0), generator(seed, 4), scenario.detail)
     best: Session | None = None
     for attempt in range(_ATTEMPTS):
         trajectory = plan(scenario, cell, motion.chassis(0.0), generator(seed, 5, scenario.initialisation, attempt))
@@ -166,20 +160,19 @@ def _choose_picks(session: Session) -> dict[int, list[Click]]:
             found = _clicks_at(session, "m_left", frame / rate, 10 + number)
             if len(found) == len(session.cell.points):
                 if session.scenario.picks.in_kinect:
-                    found = [
-                        *found,
-                        *_clicks_at(session, "b_rgb", kinect_time(session.scenario, frame / rate), 20 + number),
-                    ]
+                    number_b = kinect_number(session.scenario, frame / rate)
+                    seen_s = number_b / session.scenario.kinect.rate_hz + KINECT_PHASE_S
+                    found = [*found, *_clicks_at(session, "b_rgb", seen_s, 20 + number)]
                 chosen[frame] = found
                 break
     return chosen
 
 
-def kinect_time(scenario: Scenario, time_s: float) -> float:
-    """Time of the Kinect's image nearest to a time (its colour image; depth follows the same beat)."""
+def kinect_number(scenario: Scenario, time_s: float) -> int:
+    """Number of the Kinect's image nearest to a time."""
     rate = scenario.kinect.rate_hz
     last = int(np.floor(scenario.duration_s * rate + 1e-6)) - 1
-    return min(max(round((time_s - KINECT_PHASE_S) * rate), 0), last) / rate + KINECT_PHASE_S
+    return min(max(round((time_s - KINECT_PHASE_S) * rate), 0), last)
 
 
 KINECT_PHASE_S = 0.013

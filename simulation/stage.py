@@ -1,7 +1,7 @@
 """The scene as triangles with texture charts, ready for rays: where they hit, and how bright it is there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -14,6 +14,8 @@ from .rigid import transform
 from .surfaces import Body, Patch
 
 Float = NDArray[np.float64]
+FINE_PRINT_M = 0.0005
+_CHUNK = 400_000
 Poses = Mapping[str, Float]
 """Body name -> `w_T_body`, shape (4, 4)."""
 
@@ -110,11 +112,16 @@ class View:
             rays: shape (n, 6).
             spread: size of a sample at distance 1, in lengths of the direction (1 / focal length in samples).
         """
+        parts = [rays[i : i + _CHUNK] for i in range(0, len(rays), _CHUNK)]
+        return np.concatenate([self._radiance(part, spread, colour) for part in parts])
+
+    def _radiance(self, rays: NDArray[np.float32], spread: float, colour: bool) -> NDArray[np.float32]:
         hits = self.cast(rays)
         stage = self.stage
         uv = np.take(stage.uv, hits.triangle, axis=0)
         a, b = hits.barycentric[:, 0], hits.barycentric[:, 1]
-        texels = np.stack([uv[:, 0] + a * uv[:, 2] + b * uv[:, 4], uv[:, 1] + a * uv[:, 3] + b * uv[:, 5]])
+        along = uv[:, 0] + a * uv[:, 2] + b * uv[:, 4], uv[:, 1] + a * uv[:, 3] + b * uv[:, 5]
+        texels = np.stack(along).astype(np.float32, copy=False)
         direction = rays[:, 3:]
         cosine = np.abs(np.einsum("ij,ij->i", hits.flat_normal, direction))
         cosine /= np.sqrt(np.einsum("ij,ij->i", direction, direction))
@@ -180,8 +187,14 @@ def _mirrors(stage: Stage) -> NDArray[np.float32]:
     return np.array([patch.specular for patch in stage.patches], np.float32)
 
 
-def build_stage(bodies: list[Body], lamps: list[Lamp], poses: Poses, rng: np.random.Generator) -> Stage:
-    """Triangles, textures and baked light (soft shadows, ambient occlusion) of a scene at rest in `poses`."""
+def build_stage(
+    bodies: list[Body], lamps: list[Lamp], poses: Poses, rng: np.random.Generator, detail: float = 1.0
+) -> Stage:
+    """Triangles, textures and baked light (soft shadows, ambient occlusion) of a scene at rest in `poses`.
+
+    `detail` divides the size of the texels, but for fine print.
+    """
+    bodies = [Body(body.name, [_finer(patch, detail) for patch in body.patches]) for body in bodies]
     patches = tuple(patch for body in bodies for patch in body.patches)
     looks = [p.texture(p.shape.width_m, p.shape.height_m, p.texel_m, rng).astype(np.float32) for p in patches]
     meshes, first, uvs, normals, charts = [], [], [], [], []
@@ -224,6 +237,10 @@ def build_stage(bodies: list[Body], lamps: list[Lamp], poses: Poses, rng: np.ran
         build_atlas(lit),
         stage.lamps,
     )
+
+
+def _finer(patch: Patch, detail: float) -> Patch:
+    return patch if patch.texel_m < FINE_PRINT_M else replace(patch, texel_m=patch.texel_m / detail)
 
 
 def _lit(

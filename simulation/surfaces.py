@@ -14,6 +14,14 @@ Texture = Callable[[float, float, float, np.random.Generator], NDArray[np.float3
 """(width m, height m, texel m, generator) -> reflectance 0..1, shape (rows, columns) that cover the chart."""
 
 
+def across(axis: Float) -> tuple[Float, Float]:
+    """Two unit vectors across a unit axis; the second is the first one crossed with the axis."""
+    helper = np.eye(3)[np.argmin(np.abs(axis))]
+    first: Float = np.cross(axis, helper).astype(float)
+    first /= np.linalg.norm(first)
+    return first, np.cross(first, axis).astype(float)
+
+
 @dataclass(frozen=True, slots=True)
 class Rectangle:
     """A flat rectangle: `origin + u eu + v ev`, seen from the side where eu points right and ev down."""
@@ -51,10 +59,7 @@ class Tube:
 
     def at(self, u: Float, v: Float) -> tuple[Float, Float]:
         """Points and outward normals, shape (n, 3) each."""
-        helper = np.eye(3)[np.argmin(np.abs(self.axis))]
-        first = np.cross(self.axis, helper)
-        first /= np.linalg.norm(first)
-        second = np.cross(first, self.axis)
+        first, second = across(self.axis)
         angle = u / self.radius_m
         normals = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second
         return self.top + v[:, None] * self.axis + self.radius_m * normals, normals
@@ -163,8 +168,6 @@ def rod(
     """A closed cylinder from start to end."""
     axis = (end - start) / np.linalg.norm(end - start)
     tube = Tube(start, axis, radius_m, float(np.linalg.norm(end - start)), segments)
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    first = np.cross(axis, helper) / np.linalg.norm(np.cross(axis, helper))
-    second = np.cross(axis, first)
-    caps = [Ring(start, first, second, 0.0, radius_m), Ring(end, second, first, 0.0, radius_m)]
+    first, second = across(axis)
+    caps = [Ring(start, second, first, 0.0, radius_m), Ring(end, first, second, 0.0, radius_m)]
     return [Patch(shape, texture, texel_m, tint_bgr, specular) for shape in (tube, *caps)]

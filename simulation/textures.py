@@ -4,6 +4,7 @@ Every function has the form `(width_m, height_m, texel_m, rng) -> float32 (rows,
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,23 +19,35 @@ def size(width_m: float, height_m: float, texel_m: float) -> tuple[int, int]:
     return max(1, int(np.ceil(height_m / texel_m - 1e-9))), max(1, int(np.ceil(width_m / texel_m - 1e-9)))
 
 
+def _limited(image: NDArray[Any], low: float = 0.02, high: float = 0.9) -> Image:
+    return np.clip(image, low, high).astype(np.float32)
+
+
 def clouds(shape: tuple[int, int], texel_m: float, coarsest_m: float, octaves: int, fall: float, rng: Rng) -> Image:
     """Smooth noise of several octaves, about zero mean and unit deviation, from `coarsest_m` downwards."""
-    total = np.zeros(shape, np.float32)
+    # Coarse octaves are made at a quarter of the resolution.
+    small_shape = (shape[0] // 4 + 2, shape[1] // 4 + 2)
+    coarse, fine = np.zeros(small_shape, np.float32), np.zeros(shape, np.float32)
     weight = 0.0
     for octave in range(octaves):
         cell = max(coarsest_m / 2**octave / texel_m, 1.0)
-        small = rng.standard_normal([int(n / cell) + 3 for n in shape]).astype(np.float32)
-        # A random shift keeps the grids of the octaves from lining up.
-        shift = rng.random(2)
-        matrix = np.array([[1 / cell, 0, shift[0]], [0, 1 / cell, shift[1]]])
-        flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        layer = cv2.warpAffine(small, matrix, (shape[1], shape[0]), flags=flags, borderMode=cv2.BORDER_REFLECT)
-        total += fall**octave * layer
+        target = coarse if cell > 24 else fine
+        target += fall**octave * _waves(target.shape, cell / 4 if cell > 24 else cell, rng)
         weight += fall ** (2 * octave)
         if cell <= 1.0:
             break
-    return total / np.float32(0.75 * np.sqrt(weight))
+    wide = cv2.resize(coarse, (small_shape[1] * 4, small_shape[0] * 4), interpolation=cv2.INTER_LINEAR)
+    return (fine + wide[: shape[0], : shape[1]]) / np.float32(0.75 * np.sqrt(weight))
+
+
+def _waves(shape: tuple[int, ...], cell: float, rng: Rng) -> Image:
+    """One octave: a grid of random numbers `cell` texels apart, shifted at random so that octaves do not line up."""
+    small = rng.standard_normal([int(n / cell) + 3 for n in shape]).astype(np.float32)
+    shift = rng.random(2)
+    matrix = np.array([[1 / cell, 0, shift[0]], [0, 1 / cell, shift[1]]])
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    size_px = (shape[1], shape[0])
+    return np.asarray(cv2.warpAffine(small, matrix, size_px, flags=flags, borderMode=cv2.BORDER_REFLECT), np.float32)
 
 
 def plain(level: float = 0.5, grain: float = 0.02, blotch: float = 0.03) -> Callable[..., Image]:
@@ -46,7 +59,7 @@ def plain(level: float = 0.5, grain: float = 0.02, blotch: float = 0.03) -> Call
         image += grain * rng.standard_normal(shape).astype(np.float32)
         for _ in range(int(rng.poisson(6 * width_m * height_m))):
             scratch(image, texel_m, rng, rng.uniform(-0.25, 0.15) * level)
-        return np.clip(image, 0.02, 0.95)
+        return _limited(image)
 
     return texture
 
@@ -86,7 +99,7 @@ def brick(tone: float, brick_m: tuple[float, float] = (0.215, 0.065), mortar_m: 
         mortar = 1.5 * tone * (1 + 0.08 * clouds(shape, texel_m, 0.02, 2, 0.8, rng))
         image = face * surface + (1 - face) * mortar
         image *= 1 + 0.16 * clouds(shape, texel_m, 0.9, 4, 0.6, rng)
-        return np.clip(image * drips(shape, texel_m, rng), 0.02, 0.9).astype(np.float32)
+        return _limited(image * drips(shape, texel_m, rng))
 
     return texture
 
@@ -95,7 +108,7 @@ def drips(shape: tuple[int, int], texel_m: float, rng: Rng) -> Image:
     """Water marks that run down: a factor about one."""
     lines = rng.standard_normal((max(2, int(shape[0] * texel_m / 0.7)), max(4, int(shape[1] * texel_m / 0.05))))
     wide = cv2.resize(lines.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
-    return np.clip(1 + 0.10 * wide, 0.5, 1.4)
+    return _limited(1 + 0.10 * wide, 0.5, 1.4)
 
 
 def concrete(tone: float) -> Callable[..., Image]:
@@ -109,7 +122,7 @@ def concrete(tone: float) -> Callable[..., Image]:
             blot(image, texel_m, rng)
         for _ in range(int(2 + 0.5 * width_m * height_m)):
             crack(image, texel_m, rng)
-        return np.clip(image, 0.02, 0.9)
+        return _limited(image)
 
     return texture
 
@@ -140,7 +153,8 @@ def wood(tone: float) -> Callable[..., Image]:
     def texture(width_m: float, height_m: float, texel_m: float, rng: Rng) -> Image:
         shape = size(width_m, height_m, texel_m)
         stretch = clouds((shape[0], max(4, shape[1] // 12)), texel_m, 0.04, 4, 0.8, rng)
-        image = tone * (1 + 0.13 * cv2.resize(stretch, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR))
+        grain = np.asarray(cv2.resize(stretch, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR), np.float32)
+        image = np.asarray(tone * (1 + 0.13 * grain), np.float32)
         plank = rng.uniform(0.09, 0.14)
         for index, top in enumerate(np.arange(0, height_m, plank)):
             rows = slice(int(top / texel_m), int((top + plank) / texel_m))
@@ -152,7 +166,7 @@ def wood(tone: float) -> Callable[..., Image]:
         word(image, texel_m, rng, 0.25 * min(width_m, height_m), 0.25 * tone)
         for _ in range(int(rng.integers(1, 6))):
             blot(image, texel_m, rng)
-        return np.clip(image, 0.02, 0.9)
+        return _limited(image)
 
     return texture
 
@@ -198,7 +212,7 @@ def poster(width_m: float, height_m: float, texel_m: float, rng: Rng) -> Image:
     line = max(3, int(0.018 / texel_m))
     for row in range(int(0.78 * shape[0]), shape[0] - line, line):
         _text_line(image, row, line, ink, rng)
-    return np.clip(image * (1 + 0.05 * clouds(shape, texel_m, 0.3, 3, 0.6, rng)), 0.02, 0.9)
+    return _limited(image * (1 + 0.05 * clouds(shape, texel_m, 0.3, 3, 0.6, rng)))
 
 
 def _text_line(image: Image, row: int, line: int, ink: float, rng: Rng) -> None:
@@ -221,7 +235,7 @@ def steel(tone: float, streaks: float = 0.05) -> Callable[..., Image]:
             spot = (rng.random(2) * [shape[1], shape[0]]).astype(int)
             radius = max(1, int(rng.gamma(1.5, 0.003) / texel_m))
             cv2.circle(image, spot.tolist(), radius, tone * rng.uniform(0.45, 0.8), -1, cv2.LINE_AA)
-        return np.clip(image, 0.02, 0.9).astype(np.float32)
+        return _limited(image)
 
     return texture
 
@@ -234,7 +248,7 @@ def stripes(width_m: float, height_m: float, texel_m: float, rng: Rng) -> Image:
     wave = np.sin((u + v) * 2 * np.pi / 0.12 + rng.uniform(0, 6))
     image = np.where(wave > 0, 0.55, 0.08).astype(np.float32)
     wear = np.clip(1.5 * clouds(shape, texel_m, 0.1, 5, 0.8, rng) - 0.9, 0, 1)
-    return np.clip(image + wear * (0.35 - image), 0.02, 0.9)
+    return _limited(image + wear * (0.35 - image))
 
 
 def grille(width_m: float, height_m: float, texel_m: float, rng: Rng) -> Image:
