@@ -7,6 +7,7 @@ stated probability is never more than the true one. NO-GO where no further measu
 coarse, or the place itself is forbidden. All else is MEASURE MORE, and so is every doubt about the estimate as such.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -203,11 +204,22 @@ def _blockers(
         f"the record holds an error ({event.text.rstrip('.')})" for event in result.events if event.severity == "error"
     ]
     found += _trust_expired(cut, result)
+    newest = _newest_station(result)
+    if newest is not None and re.fullmatch(r"b\d+", point.frame) and point.frame != newest:
+        found.append(
+            f"the machine has been moved since: {point.id} is given in {point.frame}, it now stands at {newest}"
+        )
     if validated is None:
         found.append("the stated uncertainty has not been validated against truth (no validated range is installed)")
     else:
         found += validated.outside(result, point)
     return tuple(found)
+
+
+def _newest_station(result: Result) -> str | None:
+    """The last of the stations `b0`, `b1`, ... where the machine has been moved."""
+    numbers = [int(pose.name[1:]) for pose in result.poses if re.fullmatch(r"b\d+", pose.name)]
+    return f"b{max(numbers)}" if numbers else None
 
 
 def _trust_expired(cut: Cut, result: Result) -> list[str]:

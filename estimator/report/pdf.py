@@ -73,6 +73,14 @@ def _footer(canvas: Canvas, template: BaseDocTemplate, text: str, pages: int | N
     canvas.drawRightString(A4[0] - MARGIN, 10 * mm, f"{template.page} of {pages}")
 
 
+class _Together(KeepTogether):
+    """Flowables that stay on one page, and can still be told apart."""
+
+    def __init__(self, parts: list[Flowable]) -> None:
+        super().__init__(parts)
+        self.parts = parts
+
+
 class _Heading(Text):
     """Told apart for the page breaks."""
 
@@ -138,7 +146,7 @@ def _flowables(block: Block) -> list[Flowable]:
 
 def _drawing(drawing: Drawing, width: float = FRAME) -> Flowable:
     figure = FigureFlowable(drawing.figure, width)
-    return KeepTogether([figure, _text(drawing.caption, 8.5, before=2, after=5)])
+    return _Together([figure, _text(drawing.caption, 8.5, before=2, after=5)])
 
 
 def _gallery(gallery: Gallery) -> list[Flowable]:
@@ -213,19 +221,21 @@ def _table(table: Table) -> list[Flowable]:
         return [caption]
     grid = Grid(content, [share * FRAME for share in shares], style=layout, repeatRows=len(head))
     if len(content) <= ROWS_TOGETHER:
-        return [KeepTogether([caption, grid]), Spacer(1, 6)]
+        return [_Together([caption, grid]), Spacer(1, 6)]
     return [caption, grid, Spacer(1, 6)]
 
 
 def _keep_headings(story: list[Flowable]) -> list[Flowable]:
-    """Headings stay with what follows: with a figure as a whole, with a table's or a text's first lines."""
+    """Headings stay with what follows: with a figure or short table as a whole, else with its first lines."""
     kept: list[Flowable] = []
-    for flowable, following in zip(story, [*story[1:], None], strict=True):
-        if isinstance(flowable, _Heading) and not (kept and isinstance(kept[-1], PageBreak)):
+    for flowable in story:
+        last = kept[-1] if kept else None
+        if isinstance(flowable, _Together) and isinstance(last, _Heading):
+            kept[-1] = _Together([last, *flowable.parts])
+            continue
+        if isinstance(flowable, _Heading) and not isinstance(last, PageBreak | _Heading):
             kept.append(CondPageBreak(32 * mm))
         elif isinstance(flowable, _Caption):
             kept.append(CondPageBreak(18 * mm))
-        if isinstance(flowable, _Heading) and isinstance(following, KeepTogether):
-            flowable.keepWithNext = 1
         kept.append(flowable)
     return kept
