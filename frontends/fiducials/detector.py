@@ -27,7 +27,7 @@ _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
 """Of the pattern's edges, what has to be seen as the model says."""
-_SETTLED_PX = 0.1
+_SETTLED_PX = 0.3
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
 
