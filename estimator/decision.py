@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from ..factors.rig import Cut, Rig
@@ -330,18 +329,20 @@ def _all_hold(requirements: tuple[Requirement, ...]) -> float:
 
 
 def _margin(cut: Cut, point: PointEstimate, obstacles: tuple[Obstacle, ...], required: float) -> float | None:
-    """Root of P(factor) = required over the logarithm of the factor; the probability falls as the factor grows."""
+    """Bisection over the logarithm of the factor; the probability falls as the factor grows."""
 
-    def spare(logarithm: float) -> float:
+    def holds(logarithm: float) -> bool:
         covariance = np.exp(2 * logarithm) * point.covariance_m2
         rows = (_clearance(cut, covariance, obstacle).probability for obstacle in obstacles)
-        return tolerance_probability(cut, covariance, point.axis) - sum(1 - row for row in rows) - required
+        return tolerance_probability(cut, covariance, point.axis) - sum(1 - row for row in rows) >= required
 
     low, high = np.log(SCALES)
-    if spare(low) < 0 or spare(high) >= 0:
+    if not holds(low) or holds(high):
         return None
-    root, _ = brentq(spare, low, high, xtol=1e-4, full_output=True, disp=False)
-    return float(np.exp(root))
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return float(np.exp(low))
 
 
 def _notes(cut: Cut, point: PointEstimate | None, obstacles: tuple[Obstacle, ...]) -> tuple[str, ...]:
