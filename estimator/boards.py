@@ -99,12 +99,19 @@ class Boards:
         page = page_corners(self._markers[sheet.board.id, marker], side, scale)
         return np.array([self._state.pose(sheet.key).transformFrom(corner) for corner in page])
 
-    def add(self, keyframe: int, camera_poses: dict[str, gtsam.Pose3], sightings: Sequence[MarkerSighting]) -> Update:
+    def add(
+        self,
+        keyframe: int,
+        camera_poses: dict[str, gtsam.Pose3],
+        sightings: Sequence[MarkerSighting],
+        force: bool = False,
+    ) -> Update:
         """Sightings at a keyframe.
 
         Args:
             keyframe: key of the pose that the cameras hang on (`o_T_m` or `o_T_b`).
             camera_poses: `o_T_c` of each camera as believed now.
+            force: a board starts even from a view that allows two poses.
         """
         update = Update()
         for name, sheet in self._sheets.items():
@@ -113,7 +120,7 @@ class Boards:
                 continue
             if not sheet.known:
                 sheet.held.append((keyframe, seen))
-                if not self._start(sheet, camera_poses, seen, update):
+                if not self._start(sheet, camera_poses, seen, update, force):
                     continue
                 held, sheet.held = sheet.held, []
                 for key, earlier in held:
@@ -124,34 +131,69 @@ class Boards:
 
     # First pose -----------------------------------------------------------------------------------------------
 
+    def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
+        """Would a board get its first pose from these sightings of one frame alone?"""
+        by_view: dict[tuple[str, str], list[MarkerSighting]] = {}
+        for s in sightings:
+            by_view.setdefault((s.board, s.camera), []).append(s)
+        return any(self.margin(seen) > self._gate() for seen in by_view.values())
+
+    def margin(self, seen: list[MarkerSighting]) -> float:
+        """Chi-square by which the second pose of a board in one image is worse than the first; infinite for one."""
+        sheet = self._sheets[seen[0].board]
+        K = self._state.intrinsics(keys.intrinsics(seen[0].camera)).K()
+        side = self._side(sheet, seen, K)
+        poses = self._candidates(sheet.board, seen, K, side)
+        here = {seen[0].camera: gtsam.Pose3()}
+        scores = sorted(self._score(sheet.board, here, seen, pose3(p.camera_T_plane), side) for p in poses)
+        if not scores:
+            return -1.0
+        return scores[1] - scores[0] if len(scores) > 1 else float("inf")
+
+    def _gate(self) -> float:
+        """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
+        return float(chi2.ppf(1 - self._rig.gates.gate_probability, 6))
+
     def _start(
-        self, sheet: _Sheet, camera_poses: dict[str, gtsam.Pose3], seen: list[MarkerSighting], update: Update
+        self,
+        sheet: _Sheet,
+        camera_poses: dict[str, gtsam.Pose3],
+        seen: list[MarkerSighting],
+        update: Update,
+        force: bool = False,
     ) -> bool:
         """Gives the board its first pose when one is sure; adds its variables and priors."""
         camera = max(camera_poses, key=lambda c: sum(s.camera == c for s in seen))
         mine = [s for s in seen if s.camera == camera]
         K = self._state.intrinsics(keys.intrinsics(camera)).K()
         side = self._side(sheet, mine, K)
-        poses = self._candidates(sheet.board, mine, K, side)
+        candidates = self._candidates(sheet.board, mine, K, side)
+        poses = [camera_poses[camera].compose(pose3(p.camera_T_plane)) for p in candidates]
         if not poses:
             return False
-        scores = [
-            self._score(sheet.board, camera_poses, seen, camera_poses[camera].compose(pose3(p.camera_T_plane)), side)
-            for p in poses
-        ]
+        scores = [self._score_of_held(sheet, pose, side) for pose in poses]
         order = np.argsort(scores)
-        gate = float(chi2.ppf(1 - self._rig.gates.gate_probability, 6))
-        if len(poses) > 1 and scores[order[1]] - scores[order[0]] < gate:
-            if len(sheet.held) < VIEWS_TO_DECIDE:
+        if len(poses) > 1 and scores[order[1]] - scores[order[0]] < self._gate():
+            if len(sheet.held) < VIEWS_TO_DECIDE and not force:
                 return False
-            self._say(
-                seen[0].stamp_ns, "ambiguous_start", f"board {sheet.board.id} starts from an ambiguous view", "info"
-            )
-        o_T_f = camera_poses[camera].compose(pose3(poses[int(order[0])].camera_T_plane))
-        update.guess(sheet.key, o_T_f)
+            text = f"board {sheet.board.id} starts from a view that allows two poses; took the better one"
+            self._say(seen[0].stamp_ns, "ambiguous_start", text, "info")
+        update.guess(sheet.key, poses[int(order[0])])
         self._open_page(sheet, side, seen[0].stamp_ns, update)
         sheet.known = True
         return True
+
+    def _score_of_held(self, sheet: _Sheet, o_T_f: gtsam.Pose3, side: tuple[float, float | None]) -> float:
+        """Chi-square of a pose over all views that were held back."""
+        total = 0.0
+        for key, seen in sheet.held:
+            poses = {s.camera: self._camera_pose(key, s.camera) for s in seen}
+            total += self._score(sheet.board, poses, seen, o_T_f, side)
+        return total
+
+    def _camera_pose(self, key: int, camera: str) -> gtsam.Pose3:
+        pose = self._state.pose(key)
+        return pose if camera == "m_left" else pose.compose(self._state.pose(keys.extrinsics(camera)))
 
     def _side(self, sheet: _Sheet, seen: list[MarkerSighting], K: Float) -> tuple[float, float | None]:
         """Side length to start with, and the sigma with which the image itself knows it (None: not at all)."""

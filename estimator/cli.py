@@ -15,6 +15,7 @@ An unexpected exception is a defect and keeps its traceback.
 
 import ast
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
@@ -30,6 +31,7 @@ GROUP = "surecut.commands"
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its status."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a bad image is told in our own one line
     given = list(sys.argv[1:] if arguments is None else arguments)
     run = typer.main.get_command(application(given))
     try:

@@ -9,7 +9,7 @@ from scipy.stats import chi2, norm
 
 from .batch import residual_norm
 from .graph import FactorLog, Record
-from .linear import LinearSystem
+from .linear import DETERMINED, LinearSystem, deviate
 from .result import Consistency, FamilyConsistency
 
 Float = NDArray[np.float64]
@@ -80,7 +80,7 @@ def prior_tests(
         hat = A @ system.solve(A.T)
         spread = np.eye(A.shape[0]) - 0.5 * (hat + hat.T)
         eigenvalues, vectors = np.linalg.eigh(spread)
-        free = eigenvalues > 1e-3
+        free = eigenvalues > DETERMINED
         if not free.any():
             continue
         residual = -system.b[rows]
@@ -89,14 +89,6 @@ def prior_tests(
         dof = int(free.sum())
         tests.append(PriorTest(record, total, dof, deviate(total, dof), residual))
     return tests
-
-
-def deviate(total: float, dof: int) -> float:
-    """Chi-square in words of sigmas of one normal variable, two-sided."""
-    tail = float(chi2.sf(total, dof))
-    if tail < 1e-300:
-        return float(np.sqrt(total))
-    return float(norm.isf(tail / 2))
 
 
 def judge(families: tuple[FamilyConsistency, ...], priors: list[PriorTest], paths: dict[str, float]) -> Consistency:

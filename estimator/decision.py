@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from ..factors.rig import Cut, Rig
@@ -90,7 +91,7 @@ def decide(result: Result, rig: Rig, validated: ValidatedRange | None) -> tuple[
 def decide_cut(cut: Cut, point: PointEstimate | None, result: Result, validated: ValidatedRange | None) -> Decision:
     """The verdict for one cut; `point` is None where the recording holds no pick of it."""
     required = 1 - cut.wrong_go_probability
-    tool_only = tolerance_probability(cut, np.zeros((3, 3)), None if point is None else point.axis)
+    tool_only = tolerance_probability(cut, np.zeros((3, 3)), None if point is None else _axis(point))
     age_limit_ns = int(cut.board_age_limit_s * 1e9)
     last = result.last_board_view_ns
     blockers = _blockers(cut, point, result, validated)
@@ -228,16 +229,14 @@ def _covariance_fault(point: PointEstimate) -> str | None:
         return f"the covariance of {point.id} is not symmetric"
     if values[0] <= SINGULAR * values[-1] or values[-1] <= 0:
         return f"the covariance of {point.id} is singular: one direction was never measured or is claimed to be exact"
-    axis = point.axis
-    if axis is not None and not (np.isfinite(axis).all() and abs(np.linalg.norm(axis) - 1) < 1e-3):
+    if point.axis is not None and _axis(point) is None:
         return f"the axis of the pipe at {point.id} is no direction"
     return None
 
 
 def _obstacles(cut: Cut, point: PointEstimate, result: Result) -> tuple[Obstacle, ...]:
     own = _own_pipe(point, result)
-    axis = None if point.axis is None else point.axis / np.linalg.norm(point.axis)
-    disc = SweptDisc(point.position_m, axis, own.radius_m if own else 0.0, cut.blade_width_m / 2)
+    disc = SweptDisc(point.position_m, _axis(point), own.radius_m if own else 0.0, cut.blade_width_m / 2)
     found: list[Obstacle] = []
     for index, box in enumerate(cut.keep_out):
         gap, direction = box_gap(disc, np.array(box.minimum_m), np.array(box.maximum_m))
@@ -253,6 +252,14 @@ def _obstacles(cut: Cut, point: PointEstimate, result: Result) -> tuple[Obstacle
         gap = surface.distance_m - float(disc.reach(surface.direction[None])[0])
         found.append(Obstacle(surface.what, gap, surface.direction, surface.sigma_m, includes_point=True))
     return tuple(found)
+
+
+def _axis(point: PointEstimate) -> Float | None:
+    """The pipe's direction at the point, unit length; None where it is unknown or no direction."""
+    axis = point.axis
+    if axis is None or not np.isfinite(axis).all() or abs(np.linalg.norm(axis) - 1) > 1e-3:
+        return None
+    return axis / np.linalg.norm(axis)
 
 
 def _own_pipe(point: PointEstimate, result: Result) -> PipeEstimate | None:
@@ -311,21 +318,18 @@ def _all_hold(requirements: tuple[Requirement, ...]) -> float:
 
 
 def _margin(cut: Cut, point: PointEstimate, obstacles: tuple[Obstacle, ...], required: float) -> float | None:
-    """Bisection on the logarithm of the factor; the probability falls as the factor grows."""
+    """Root of P(factor) = required over the logarithm of the factor; the probability falls as the factor grows."""
 
-    def holds(factor: float) -> bool:
-        covariance = factor**2 * point.covariance_m2
+    def spare(logarithm: float) -> float:
+        covariance = np.exp(2 * logarithm) * point.covariance_m2
         rows = (_clearance(cut, covariance, obstacle).probability for obstacle in obstacles)
-        kept = tolerance_probability(cut, covariance, point.axis)
-        return kept - sum(1 - row for row in rows) >= required
+        return tolerance_probability(cut, covariance, point.axis) - sum(1 - row for row in rows) - required
 
     low, high = np.log(SCALES)
-    if not holds(SCALES[0]) or holds(SCALES[1]):
+    if spare(low) < 0 or spare(high) >= 0:
         return None
-    while high - low > 1e-4:
-        middle = (low + high) / 2
-        low, high = (middle, high) if holds(float(np.exp(middle))) else (low, middle)
-    return float(np.exp(low))
+    root, _ = brentq(spare, low, high, xtol=1e-4, full_output=True, disp=False)
+    return float(np.exp(root))
 
 
 def _notes(cut: Cut, point: PointEstimate | None, obstacles: tuple[Obstacle, ...]) -> tuple[str, ...]:

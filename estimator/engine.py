@@ -74,6 +74,7 @@ class Engine:
         self._recent: dict[int, tuple[StereoFrame, int, Float]] = {}
         self._distances_open = list(rig.distances)
         self._waiting: list[Bundle] = []
+        self._forced = False
         self._pending = Update()
         self.end_ns = 0
 
@@ -178,7 +179,7 @@ class Engine:
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
         if mobile:
-            self._take(self.boards.add(key, self._camera_poses(key), mobile))
+            self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced))
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
         o_T_m = self.state.pose(key)
@@ -191,13 +192,13 @@ class Engine:
         """A keyframe without tracks stands where the known boards put it; else it waits for one of them."""
         index = len(self.odometry.keyframe_stamps)
         if index == 0:
-            pose = gtsam.Pose3()
+            found = gtsam.Pose3() if self._forced or self.boards.can_start(bundle.sightings) else None
         else:
             found = self._resect(bundle)
-            if found is None:
-                self._waiting.append(bundle)
-                return None
-            pose = found
+        if found is None:
+            self._waiting.append(bundle)
+            return None
+        pose = found
         update = Update()
         key = keys.keyframe(index)
         update.guess(key, pose)
@@ -232,11 +233,26 @@ class Engine:
         return {"m_left": o_T_m, "m_right": o_T_m.compose(self.state.pose(keys.extrinsics("m_right")))}
 
     def revisit(self) -> None:
-        """Frames that saw no known board get another chance, now that more boards are known."""
-        waiting, self._waiting = self._waiting, []
-        for bundle in waiting:
-            self._insert_keyframe(bundle)
-            self.flush()
+        """Frames that saw no known board get another chance, as long as that makes more boards known."""
+        if self._waiting and not self.odometry.keyframe_stamps:
+            self._start_from_best()
+        while self._waiting:
+            before = len(self._waiting)
+            waiting, self._waiting = self._waiting, []
+            for bundle in waiting:
+                self._insert_keyframe(bundle)
+                self.flush()
+            if len(self._waiting) == before:
+                break
+
+    def _start_from_best(self) -> None:
+        """No frame is free of doubt: the one with the least begins."""
+        best = max(self._waiting, key=lambda b: max((self.boards.margin([s]) for s in b.sightings), default=-1.0))
+        self._waiting.remove(best)
+        self._forced = True
+        self._insert_keyframe(best)
+        self._forced = False
+        self.flush()
 
     # The machine ----------------------------------------------------------------------------------------------
 

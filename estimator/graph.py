@@ -67,8 +67,8 @@ class State:
     def vector(self, key: int) -> np.ndarray:
         return self.values.atVector(key)
 
-    def intrinsics(self, key: int) -> gtsam.Cal3_S2:
-        return self.values.atCal3_S2(key)
+    def intrinsics(self, key: int) -> gtsam.Cal3DS2:
+        return self.values.atCal3DS2(key)
 
 
 class FactorLog:

@@ -7,8 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.linalg import splu
+from scipy.stats import chi2, norm
 
 Float = NDArray[np.float64]
+
+DETERMINED = 1e-3
+"""A residual direction with less than this share of its own variance left is determined by its own measurement."""
+
+
+def deviate(total: float, dof: int) -> float:
+    """Chi-square in words of sigmas of one normal variable, two-sided."""
+    tail = float(chi2.sf(total, dof))
+    return float(np.sqrt(total)) if tail < 1e-300 else float(norm.isf(tail / 2))
 
 
 class LinearSystem:
@@ -71,6 +81,18 @@ class LinearSystem:
         offsets = np.concatenate([[0], np.cumsum(widths)])
         blocks = [(k, np.eye(offsets[-1])[:, offsets[i] : offsets[i + 1]]) for i, k in enumerate(keys)]
         return self.covariance(blocks)
+
+    def standardised(self, position: int) -> float:
+        """Residual of one factor against what all others predict, as a deviate of one normal variable."""
+        rows = slice(self.starts[position], self.starts[position + 1])
+        A = self.A[rows].toarray()
+        hat = A @ self.solve(A.T)
+        eigenvalues, vectors = np.linalg.eigh(np.eye(A.shape[0]) - 0.5 * (hat + hat.T))
+        free = eigenvalues > DETERMINED
+        if not free.any():
+            return 0.0
+        along = (vectors.T @ self.b[rows])[free]
+        return deviate(float((along**2 / eigenvalues[free]).sum()), int(free.sum()))
 
     def leverage(self, group: NDArray[np.int64], groups: int, probes: int = 64, seed: int = 0) -> Float:
         """Number of parameters that each group of factors determines (trace of its part of the hat matrix).

@@ -32,8 +32,7 @@ class _Log:
     def __init__(self, inventory: Inventory, rig: Rig | None) -> None:
         self.inventory = inventory
         self.rig = rig
-        # the defaults of the rig file, read without a rig: `boards` alone has none
-        self.names = rig if rig is not None else Rig.model_construct()
+        self.names = rig if rig is not None else Rig()
 
     def names_of(self, camera: str) -> Camera:
         return getattr(self.names.cameras, camera)
@@ -210,9 +209,8 @@ def _picks(log: _Log) -> list[str]:
             texts.append(f"{where} on camera {pick.camera!r}, which does not exist; cameras: m_left, m_right, b_rgb")
             continue
         model = log.calibration(pick.camera)
-        if model is not None and not (
-            -0.5 <= pick.px[0] < model.width - 0.5 and -0.5 <= pick.px[1] < model.height - 0.5
-        ):
+        u, v = pick.px.tolist()
+        if model is not None and not (-0.5 <= u < model.width - 0.5 and -0.5 <= v < model.height - 0.5):
             size = f"{model.width}x{model.height}"
             texts.append(f"{where} at ({u:.1f}, {v:.1f}) lies outside the {size} image")
         if pick.role not in ("cut", "grasp", "other"):

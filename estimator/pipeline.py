@@ -11,6 +11,7 @@ from ..factors.errors import LogError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pipe.pairs import OutlinePrior
+from ..frontends.pipe.predict import predict_outline
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
@@ -20,9 +21,16 @@ from .sensors import PairImages, Sensors, by_info_topic
 from .surfaces import Associator, lay_on_surfaces
 
 Item = Message | StereoPair
+Float = NDArray[np.float64]
 
 KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
+OUTLINE_SPACING_M = 0.05
+"""Views of a pipe nearer to each other than this tell nothing new."""
+OUTLINE_PRIOR = (0.01, 0.05, 0.015)
+"""Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
+PART_M = 0.1
+"""A pipe is taken to go on so far beyond its picks."""
 COMPRESSED = "/compressed"
 COLOUR_PERIOD_NS = 1_000_000_000
 """Boards in the Kinect's colour image: once a second is enough for a machine that stands still."""
@@ -51,7 +59,8 @@ class Pipeline:
         self._info = by_info_topic(rig)
         self._kept: deque[PairImages] = deque()
         self._kept_bytes = 0
-        self._looked: dict[str, set[int]] = {}
+        self._looked: dict[str, dict[int, Float]] = {}
+        """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
         self._last_colour_ns = 0
 
     def run(self, messages: Iterable[Message]) -> Iterator[int]:
@@ -176,7 +185,10 @@ class Pipeline:
                 click = float(np.sqrt(pick.covariance_px2.trace() / 2))
                 prior = OutlinePrior(pick.px, click)
                 self._take(finder.find(pair.stamp_ns, pipe, pair.of(pick.camera), prior))
-                self._looked.setdefault(f"{pipe} {pick.camera}", set()).add(pair.stamp_ns)
+                where = self.engine.seen_from(pick.camera, pair.stamp_ns)
+                if where is not None:
+                    looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
+                    looked[pair.stamp_ns] = where.o_T_c.translation()
         self.engine.flush()
         for pipe in list(self.engine.pipes.cylinders):
             if self.engine.pipes.axis(pipe) is not None:
@@ -186,18 +198,21 @@ class Pipeline:
         self.engine.flush()
 
     def _seek_predicted(self, pipe: str, camera: str, pair: PairImages) -> None:
-        looked = self._looked.setdefault(f"{pipe} {camera}", set())
+        """Looks for a known pipe's outline, in views that differ from those already used."""
+        looked = self._looked.setdefault(f"{pipe} {camera}", {})
         axis = self.engine.pipes.axis(pipe)
         where = self.engine.seen_from(camera, pair.stamp_ns)
-        if pair.stamp_ns in looked or axis is None or where is None:
+        if axis is None or where is None:
             return
-        looked.add(pair.stamp_ns)
-        prior = _outline_prior(self._points_on(pipe), axis, where.o_T_c.matrix(), self.sensors.cameras[camera].K)
+        place = where.o_T_c.translation()
+        if any(np.linalg.norm(place - other) < OUTLINE_SPACING_M for other in looked.values()):
+            return
+        ends = _part_of_axis(self.engine.pipes.places(pipe), axis)
+        a, b = (where.o_T_c.transformTo(end) for end in ends)
+        prior = predict_outline(self.sensors.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
         if prior is not None:
+            looked[pair.stamp_ns] = place
             self._take(self.sensors.outline_finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))
-
-    def _points_on(self, pipe: str) -> list[NDArray[np.float64]]:
-        return self.engine.pipes.places(pipe)
 
     def _take(self, found: OutlineSighting | Rejection) -> None:
         if isinstance(found, OutlineSighting):
@@ -206,31 +221,11 @@ class Pipeline:
             self.engine.rejected.append(found)
 
 
-def _outline_prior(
-    points: list[NDArray[np.float64]],
-    axis: tuple[NDArray[np.float64], NDArray[np.float64], float],
-    o_T_c: NDArray[np.float64],
-    K: NDArray[np.float64],
-) -> OutlinePrior | None:
-    """Where the pipe's outline should be in an image, at the first picked point in view."""
-    c_T_o = np.linalg.inv(o_T_c)
-
-    def seen(p: NDArray[np.float64]) -> NDArray[np.float64]:
-        return c_T_o[:3, :3] @ p + c_T_o[:3, 3]
-
-    direction = axis[1] - axis[0]
-    direction = direction / np.linalg.norm(direction)
-    for place in points:
-        a, b = seen(place), seen(place + 0.05 * direction)
-        if a[2] < 0.2 or b[2] < 0.2:
-            continue
-        pa, pb = (K @ a)[:2] / a[2], (K @ b)[:2] / b[2]
-        if not (10 < pa[0] < 2 * K[0, 2] - 10 and 10 < pa[1] < 2 * K[1, 2] - 10):
-            continue
-        half = float(K[0, 0] * axis[2] / np.sqrt(max(a[2] ** 2 - axis[2] ** 2, 1e-6)))
-        angle = float(np.arctan2(pb[1] - pa[1], pb[0] - pa[0]))
-        return OutlinePrior(pa, 1.5, half, 0.15 * half + 0.5, angle, np.deg2rad(6.0))
-    return None
+def _part_of_axis(places: list[Float], axis: tuple[Float, Float, float]) -> tuple[Float, Float]:
+    """The part of an axis about the picked points, in {o}."""
+    direction = (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0])
+    along = [float((p - axis[0]) @ direction) for p in places] or [0.0]
+    return axis[0] + (min(along) - PART_M) * direction, axis[0] + (max(along) + PART_M) * direction
 
 
 def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -19,7 +19,7 @@ Float = NDArray[np.float64]
 REACH = 9.0
 """Sigmas after which a standard normal is nothing (2e-19)."""
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
-PANELS = 40
+PANELS = 24
 BALL_PANELS = 12
 
 

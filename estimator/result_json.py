@@ -75,6 +75,11 @@ def from_json(text: str | bytes, name: str = "result") -> Result:
         raise ResultError(f"{name}: {' '.join(str(error).split())}; run `surecut optimise` again") from error
 
 
+def stored_sha256(text: str | bytes) -> str:
+    """The hash that a result carries, which `from_json` has checked."""
+    return str(json.loads(text)["sha256"])
+
+
 def content_sha256(content: Mapping[str, Any]) -> str:
     """Hash of the decoded JSON object, without `sha256` and `timing`, keys sorted, no white space."""
     kept = {key: value for key, value in content.items() if key not in ("sha256", "timing")}

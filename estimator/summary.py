@@ -28,6 +28,8 @@ from .result import (
 )
 
 Float = NDArray[np.float64]
+INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
+"""Names of the intrinsics' components; the skew is not reported."""
 Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 
 
@@ -172,13 +174,18 @@ class Summary:
             if self._values.exists(keys.intrinsics(camera)):
                 model, settings = engine.cameras[camera], getattr(rig.cameras, camera)
                 prior = np.sqrt(np.diag(intrinsics_covariance(model, settings)))
-                mean = np.array([model.fx, model.fy, 0.0, model.cx, model.cy])
-                value = self._values.atCal3_S2(keys.intrinsics(camera)).vector()
+                mean = np.array([model.fx, model.fy, 0.0, model.cx, model.cy, 0.0, 0.0, 0.0, 0.0])
+                value = self._values.atCal3DS2(keys.intrinsics(camera)).vector()
                 sigma = self._sigmas(keys.intrinsics(camera))
                 frozen = ["focal" in settings.freeze] * 2 + [True] + ["centre" in settings.freeze] * 2
-                for i, part in ((0, "fx"), (1, "fy"), (3, "cx"), (4, "cy")):
+                frozen += ["distortion" in settings.freeze] * 4
+                for i, part in enumerate(INTRINSICS):
+                    if part is None:
+                        continue
                     rows.append(
-                        CalibrationEstimate(f"{camera}.{part}", "px", value[i], sigma[i], mean[i], prior[i], frozen[i])
+                        CalibrationEstimate(
+                            f"{camera}.{part}", "px" if i < 5 else "1", value[i], sigma[i], mean[i], prior[i], frozen[i]
+                        )
                     )
         rows += self._extrinsic_rows()
         if self._values.exists(keys.DEPTH):

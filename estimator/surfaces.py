@@ -11,6 +11,7 @@ from ..factors import keys
 from ..factors.cloud import corrected, plane_factor
 from ..factors.measurements import CloudFrame, Rejection
 from ..factors.noise import robust, sigmas
+from ..frontends.cloud.associate import associate
 from .graph import Record, State, Update
 
 Float = NDArray[np.float64]
@@ -126,5 +127,12 @@ class Surfaces:
 def lay_on_surfaces(
     landmarks_m: Float, sigma_m: Float, cloud: CloudFrame
 ) -> tuple[list[PlaneMatch], list[tuple[int, str, float, float]]]:
-    """The front end's search, in the engine's types."""
-    return [], []
+    """The front end's search, in the engine's types. Noise and quantisation of a patch both count."""
+    found = associate(landmarks_m, sigma_m, cloud)
+    sigma = np.hypot(found.sigma_m, found.bias_m)
+    matches = [
+        PlaneMatch(int(row), point, normal, float(s))
+        for row, point, normal, s in zip(found.landmark, found.point_m, found.normal, sigma, strict=True)
+    ]
+    refusals = [(i, reason, float(found.values[i]), 0.0) for i, reason in enumerate(found.reasons) if reason]
+    return matches, refusals

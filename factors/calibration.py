@@ -16,27 +16,36 @@ FROZEN_FOCAL_REL = 1e-7
 FROZEN_PX = 1e-4
 FROZEN_RAD = 1e-7
 FROZEN_M = 1e-7
+FROZEN_LENS = 1e-8
+TANGENTIAL_SHARE = 0.2
+"""Tangential distortion of a lens is a small part of its radial one."""
 ASPECT_REL = 2e-4
 """fx and fy of one lens differ by the sensor's pixel aspect only, which is known much better than the focal length."""
 
 
-def cal3(camera: CameraModel) -> gtsam.Cal3_S2:
-    """The ideal pinhole of a camera."""
-    return gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
+def cal3(camera: CameraModel) -> gtsam.Cal3DS2:
+    """The pinhole of a camera; pixels in the graph are ideal ones, so its remaining distortion starts at zero."""
+    return gtsam.Cal3DS2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, 0.0, 0.0, 0.0, 0.0)
 
 
 def intrinsics_covariance(camera: CameraModel, settings: Camera) -> Float:
-    """Covariance of (fx, fy, skew, cx, cy), shape (5, 5): one common relative error of the focal length."""
+    """Covariance of (fx, fy, skew, cx, cy, k1, k2, p1, p2), shape (9, 9): one common relative error of the focal length.
+
+    k and p are what the given lens model leaves over (radial and tangential, Brown 1966), at the normalised radius 1.
+    """
     focal = FROZEN_FOCAL_REL if "focal" in settings.freeze else max(settings.focal_sigma_rel, FROZEN_FOCAL_REL)
     centre = FROZEN_PX if "centre" in settings.freeze else max(settings.centre_sigma_px, FROZEN_PX)
+    lens = FROZEN_LENS if "distortion" in settings.freeze else max(settings.distortion_sigma, FROZEN_LENS)
     f = np.array([camera.fx, camera.fy])
-    covariance = np.diag([0.0, 0.0, 1e-10, centre**2, centre**2])
+    radial, tangential = lens**2, (TANGENTIAL_SHARE * lens) ** 2
+    covariance = np.diag([0.0, 0.0, 1e-10, centre**2, centre**2, radial, radial, tangential, tangential])
     covariance[:2, :2] = focal**2 * np.outer(f, f) + np.diag((min(ASPECT_REL, focal) * f) ** 2)
     return covariance
 
 
 def intrinsics_prior(name: str, camera: CameraModel, settings: Camera) -> gtsam.NonlinearFactor:
-    return gtsam.PriorFactorCal3_S2(
+    """Prior of a camera's intrinsics."""
+    return gtsam.PriorFactorCal3DS2(
         keys.intrinsics(name), cal3(camera), gaussian(intrinsics_covariance(camera, settings))
     )
 

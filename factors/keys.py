@@ -76,7 +76,7 @@ CAMERA_INDEX = {"m_left": 0, "m_right": 1, "b_rgb": 2}
 
 
 def intrinsics(camera: str) -> int:
-    """Ideal pinhole of a camera: Cal3_S2."""
+    """A camera's pinhole, and what its given lens model leaves over: Cal3DS2."""
     return gtsam.symbol("k", CAMERA_INDEX[camera])
 
 

@@ -22,7 +22,7 @@ def mobile_projection(camera: str, px: Float, model: Model, keyframe: int, point
         point: key of the point in {o}.
     """
     if camera == "m_left":
-        return gtsam.GeneralSFMFactor2Cal3_S2(px, model, keyframe, point, keys.intrinsics(camera))
+        return gtsam.GeneralSFMFactor2Cal3DS2(px, model, keyframe, point, keys.intrinsics(camera))
     return _with_extrinsics(camera, px, model, keyframe, point)
 
 
@@ -32,7 +32,7 @@ def machine_projection(px: Float, model: Model, base: int, point: int) -> gtsam.
 
 
 def _with_extrinsics(camera: str, px: Float, model: Model, pose: int, point: int) -> gtsam.NonlinearFactor:
-    return gtsam_unstable.ProjectionFactorPPPCCal3_S2(
+    return gtsam_unstable.ProjectionFactorPPPCCal3DS2(
         px, model, pose, keys.extrinsics(camera), point, keys.intrinsics(camera)
     )
 

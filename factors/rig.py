@@ -37,7 +37,9 @@ class Camera(Section):
     markers_topic: str | None = None
     focal_sigma_rel: NonNegative = 0.003
     centre_sigma_px: NonNegative = 1.0
-    freeze: tuple[Literal["focal", "centre"], ...] = ()
+    distortion_sigma: NonNegative = 0.002
+    """What the given lens model leaves over: sigma of its radial coefficients, at 45 degrees from the axis."""
+    freeze: tuple[Literal["focal", "centre", "distortion"], ...] = ()
 
 
 class Cameras(Section):

@@ -1,6 +1,7 @@
 """Bytes from a file or a pipe, counted and hashed as they pass, with a way to put some back."""
 
 import hashlib
+import zlib
 from typing import BinaryIO
 
 _PIECE = 1 << 24
@@ -15,13 +16,24 @@ class EndOfStream(Exception):
 
 
 class ByteStream:
-    """Forward reading only, so that a file and a pipe are the same."""
+    """Forward reading only, so that a file and a pipe are the same.
 
-    def __init__(self, stream: BinaryIO) -> None:
+    Args:
+        with_crc: keep `crc` up to date.
+    """
+
+    def __init__(self, stream: BinaryIO, with_crc: bool = False) -> None:
         self._stream = stream
         self._back = b""
         self._hash = hashlib.sha256()
         self._read = 0
+        self._with_crc = with_crc
+        self._crc = 0
+
+    @property
+    def crc(self) -> int | None:
+        """CRC-32 of everything before `position`; None where it is not kept or bytes were put back."""
+        return self._crc if self._with_crc and not self._back else None
 
     @property
     def position(self) -> int:
@@ -74,5 +86,7 @@ class ByteStream:
     def _next(self, length: int) -> bytes:
         data = self._stream.read(length) or b""
         self._hash.update(data)
+        if self._with_crc:
+            self._crc = zlib.crc32(data, self._crc)
         self._read += len(data)
         return data

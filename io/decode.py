@@ -56,3 +56,8 @@ def decoder_for(channel: ChannelInfo) -> Decoder:
 def label(topic: str, log_time_ns: int) -> str:
     """Topic and time, for errors."""
     return f"{topic} at {log_time_ns / 1e9:.3f} s"
+
+
+def in_one_line(error: BaseException) -> str:
+    """Kind and message of an error that a parser raised."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

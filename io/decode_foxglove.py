@@ -12,7 +12,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from ..factors.errors import LogError
 from .calibration import Calibration, camera_model
 from .clouds import RawCloud, checked
-from .decode import Bytes, ChannelInfo, DecodeError, Decoder, label
+from .decode import Bytes, ChannelInfo, DecodeError, Decoder, in_one_line, label
 from .messages import Body, CameraInfoBody, CloudBody, DepthBody, ImageBody, JsonBody, Message, OtherBody, PoseBody
 from .pixels import DEPTH_ENCODINGS, CompressedPixels, RawPixels, normalised
 from .rotations import pose_matrix
@@ -36,7 +36,7 @@ def protobuf_decoder(channel: ChannelInfo) -> Decoder:
         parse = DecoderFactory().decoder_for("protobuf", schema)
     except Exception as error:  # protobuf's own, for bytes that may be anything
         raise LogError(
-            f"{channel.topic}: the definition of {channel.schema_name} in the log is not understood ({error})"
+            f"{channel.topic}: the log's definition of {channel.schema_name} is not understood ({in_one_line(error)})"
         ) from error
     assert parse is not None
     make = BODIES.get(channel.schema_name)
@@ -80,7 +80,7 @@ def _decoder(channel: ChannelInfo, body: Callable[[Bytes, str], tuple[Head | Non
             raise DecodeError(f"{where}: {error}") from error
         except Exception as error:
             name = channel.schema_name or "JSON message"
-            raise DecodeError(f"{where}: the data is no {name} ({type(error).__name__}: {error})") from error
+            raise DecodeError(f"{where}: the data is no {name} ({in_one_line(error)})") from error
         return Message(channel.topic, log_time_ns, stamp_ns, frame_id, content)
 
     return decode

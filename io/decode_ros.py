@@ -1,6 +1,7 @@
 """ROS 2 messages (CDR), decoded by the definition that the log carries."""
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from rosbags.typesys.store import Typestore
 from ..factors.errors import LogError
 from .calibration import Calibration, camera_model
 from .clouds import RawCloud, checked
-from .decode import Bytes, ChannelInfo, DecodeError, Decoder, label
+from .decode import Bytes, ChannelInfo, DecodeError, Decoder, in_one_line, label
 from .messages import (
     Body,
     CameraInfoBody,
@@ -52,7 +53,10 @@ def ros_decoder(channel: ChannelInfo) -> Decoder:
         LogError: the channel's definition cannot be understood.
     """
     name = full_name(channel.schema_name)
-    store = _store(channel, name)
+    try:
+        store = _store(name, channel.schema_encoding, channel.schema_data)
+    except LogError as error:
+        raise LogError(f"{channel.topic}: {error}") from error
     fields = store.fielddefs[name][1]
     has_header = bool(fields) and fields[0][0] == "header" and fields[0][1][1] == "std_msgs/msg/Header"
     make = BODIES.get(name, _other(name))
@@ -74,7 +78,7 @@ def ros_decoder(channel: ChannelInfo) -> Decoder:
                 raise
             raise DecodeError(f"{where}: {error}") from error
         except Exception as error:
-            raise DecodeError(f"{where}: the data is no {name} ({type(error).__name__}: {error})") from error
+            raise DecodeError(f"{where}: the data is no {name} ({in_one_line(error)})") from error
         return Message(topic, log_time_ns, stamp_ns, frame_id, body)
 
     return decode
@@ -86,21 +90,25 @@ def full_name(name: str) -> str:
     return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
 
 
-def _store(channel: ChannelInfo, name: str) -> Typestore:
-    """A store with the log's own definitions; the built-in ones where the log has none."""
-    if not channel.schema_data.strip():
+@lru_cache(maxsize=256)
+def _store(name: str, schema_encoding: str, schema_data: bytes) -> Typestore:
+    """A store with the log's own definitions; the built-in ones where the log has none. Parsing them takes a while.
+
+    Raises:
+        LogError: the text is not understood.
+    """
+    if not schema_data.strip():
         if name in typestore().fielddefs:
             return typestore()
         # an empty definition is right for an empty type
-        if channel.schema_encoding != "ros2msg":
-            raise LogError(f"{channel.topic}: the log holds no definition of {name}; record it with its definition")
+        if schema_encoding != "ros2msg":
+            raise LogError(f"the log holds no definition of {name}; record it with its definition")
     store = get_typestore(Stores.EMPTY)
     try:
-        store.register(get_types_from_msg(channel.schema_data.decode(), name))
+        store.register(get_types_from_msg(schema_data.decode(), name))
         store.get_msgdef(name)
     except Exception as error:  # the parser's and the code generator's own, for a text that may be anything
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        raise LogError(f"{channel.topic}: the definition of {name} in the log is not understood ({reason})") from error
+        raise LogError(f"the definition of {name} in the log is not understood ({in_one_line(error)})") from error
     return store
 
 

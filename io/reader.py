@@ -1,8 +1,7 @@
 """Read a log or a stream: one iterator of `Message`s for a file, a split recording and a pipe."""
 
 import hashlib
-from collections.abc import Collection, Iterator
-from itertools import chain
+from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -14,7 +13,7 @@ from .decode import ChannelInfo, DecodeError, Decoder, decoder_for
 from .messages import Message, OtherBody
 from .records import RawMessage, Record
 from .sources import Part, parts_of
-from .summary import Summary
+from .summary import EMPTY, Summary
 
 
 class LogReader:
@@ -43,7 +42,7 @@ class LogReader:
         self.profile = ""
         self._topics = None if topics is None else frozenset(topics)
         self._ahead: list[tuple[Part, Record]] = []
-        self._rest: Iterator[tuple[Part, Record]] | None = None
+        self._rest: Generator[tuple[Part, Record]] | None = None
 
     def __iter__(self) -> Iterator[Message]:
         """
@@ -74,7 +73,7 @@ class LogReader:
     def raw(self) -> Iterator[tuple[ChannelInfo, int, bytes | memoryview]]:
         """Channel, log time (ns) and undecoded data of every message, of all topics."""
         part: Part | None = None
-        describe = _Descriptions(Summary({}, {}, {}, None))
+        describe = _Descriptions(EMPTY)
         for at, record in self._records():
             if at is not part:  # numbers of channels and schemas are those of one file
                 part, describe = at, _Descriptions(at.summary())
@@ -117,9 +116,9 @@ class LogReader:
         return hashes[0] if len(hashes) == 1 else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
     def close(self) -> None:
-        """Close the files that this reader opened."""
-        for part in self.parts:
-            part.close()
+        """Close the file in the middle of which an iteration was left. A stream stays open."""
+        if self._rest is not None:
+            self._rest.close()
 
     def __enter__(self) -> Self:
         return self
@@ -130,11 +129,14 @@ class LogReader:
     def _records(self) -> Iterator[tuple[Part, Record]]:
         """Records of all parts; of a stream that was looked into, from its start all the same."""
         ahead, self._ahead = self._ahead, []
-        rest = self._rest or self._all_records()
-        self._rest = rest if not self.parts[0].seekable else None
-        yield from chain(ahead, rest)
+        repeatable = self.parts[0].path is not None and not ahead
+        if self._rest is None or repeatable:
+            self.close()
+            self._rest = self._all_records()
+        yield from ahead
+        yield from self._rest
 
-    def _all_records(self) -> Iterator[tuple[Part, Record]]:
+    def _all_records(self) -> Generator[tuple[Part, Record]]:
         for part in self.parts:
             for record in part.records():
                 yield part, record
@@ -201,6 +203,8 @@ class _Descriptions:
         if channel is None:
             return None
         schema = self._schemas.get(channel.schema_id) or self._summary.schemas.get(channel.schema_id)
+        if schema is None and channel.schema_id != 0:  # 0: a channel that needs none
+            return None
         name, encoding, data = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
         self._channels[number] = ChannelInfo(channel.topic, channel.message_encoding, name, encoding, bytes(data))
         return self._channels[number]

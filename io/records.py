@@ -28,6 +28,7 @@ _OTHER_LIMIT = 1 << 28
 _CHUNK_START = re.compile(rb"\x06.{5}\x00{3}", re.DOTALL)
 PARSE_ERRORS = (McapError, struct.error, UnicodeDecodeError, MemoryError, OverflowError)
 _HEADER = 9
+_DATA_KINDS = {Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.ATTACHMENT, Opcode.METADATA}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +48,16 @@ class RecordStream:
 
     Args:
         size: bytes of the whole file, where known: a record that is longer than what is left is found at once.
+        with_crc: check the checksum over all records, where the writer gave one.
 
     Raises (while iterating):
         LogError: empty, or not an MCAP.
     """
 
-    def __init__(self, stream: BinaryIO, label: str, size: int | None = None) -> None:
+    def __init__(self, stream: BinaryIO, label: str, size: int | None = None, with_crc: bool = True) -> None:
         self.report = DamageReport(label)
-        self._bytes = ByteStream(stream)
+        self._bytes = ByteStream(stream, with_crc)
+        self._crc: int | None = None
         self._label = label
         self._size = size
 
@@ -63,9 +66,11 @@ class RecordStream:
         while (head := self._head()) is not None:
             opcode, length, offset = head
             if opcode == Opcode.DATA_END:
+                self._data_end(length)
                 return
             if not self._plausible(opcode, length):
-                self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt")
+                if not self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt"):
+                    return
             elif opcode == CHUNK_OPCODE:
                 yield from self._chunk(offset, length)
             else:
@@ -93,20 +98,27 @@ class RecordStream:
     def _head(self) -> tuple[int, int, int] | None:
         """Opcode, length and offset of the next record; None at the end of the stream."""
         offset = self._bytes.position
+        self._crc = self._bytes.crc
         data = self._bytes.read_up_to(_HEADER)
         if len(data) < _HEADER:
-            self._add(Damage("cut", offset, len(data), "no end mark"))
+            if not self.report.ends_cut:
+                self._add(Damage("cut", offset, len(data), "no end mark"))
             return None
         opcode, length = struct.unpack("<BQ", data)
         return opcode, length, offset
 
+    def _data_end(self, length: int) -> None:
+        body = self._bytes.read_up_to(min(length, 4))
+        expected = int.from_bytes(body, "little") if len(body) == 4 else 0
+        if expected and self._crc is not None and self._crc != expected and not self.report.places:
+            self.report.notes.append("the checksum over all records differs, so some message is wrong")
+
     def _plausible(self, opcode: int, length: int) -> bool:
         if opcode == 0 or length > _LIMITS.get(opcode, _OTHER_LIMIT):
             return False
-        if self._size is None or self._bytes.position + length <= self._size:
-            return True
-        # Longer than the file: cut off, unless a chunk follows somewhere, which `_resynchronise` finds out.
-        return False
+        # A chunk's header tells a wrong length from a cut. Another record that is longer than the file is cut, unless
+        # a chunk follows somewhere, which `_resynchronise` finds out.
+        return opcode == CHUNK_OPCODE or self._size is None or self._bytes.position + length <= self._size
 
     def _chunk(self, offset: int, length: int) -> Iterator[Record]:
         start = self._bytes.read_up_to(min(44, length))
@@ -146,6 +158,9 @@ class RecordStream:
             self.report.last_time_ns = max(log_time_ns, self.report.last_time_ns or 0)
             yield RawMessage(channel_id, log_time_ns, body[22:])
             return
+        if not _belongs(opcode, body):
+            self._add(Damage("corrupt", offset, len(body), f"a record of kind {opcode:#x} has no place here"))
+            return
         try:
             record = _parse(opcode, body)
         except PARSE_ERRORS as error:
@@ -156,8 +171,8 @@ class RecordStream:
         elif record is not None:
             yield record
 
-    def _resynchronise(self, offset: int, seen: bytes, reason: str) -> None:
-        """Search for the next chunk after `offset`, from where `seen` was read."""
+    def _resynchronise(self, offset: int, seen: bytes, reason: str) -> bool:
+        """Search for the next chunk after `offset`, from where `seen` was read; False: there is none."""
         self._bytes.put_back(seen[1:])
         window = b""
         while True:
@@ -170,10 +185,10 @@ class RecordStream:
                 if len(record) == 44 and self._is_chunk(record, length, base + match.end()):
                     self._bytes.put_back(window[match.start() :])
                     self._add(Damage("lost", offset, base + match.start() - offset, reason))
-                    return
+                    return True
             if not more:
                 self._add(Damage("cut", offset, self._bytes.position - offset, reason))
-                return
+                return False
             window = window[-(_HEADER + 44) :]
 
     def _is_chunk(self, record: bytes, length: int, position: int) -> bool:
@@ -187,6 +202,13 @@ class RecordStream:
 def head_bytes(opcode: int, length: int) -> bytes:
     """The nine bytes before a record."""
     return struct.pack("<BQ", opcode, length)
+
+
+def _belongs(opcode: int, body: memoryview) -> bool:
+    """Whether a record may stand before the end of the data: one whose kind was damaged mostly may not."""
+    if opcode == Opcode.MESSAGE_INDEX:
+        return len(body) >= 6 and len(body) >= 6 + struct.unpack_from("<I", body, 2)[0]
+    return opcode in _DATA_KINDS or opcode >= 0x80  # those belong to applications
 
 
 def _parse(opcode: int, body: memoryview) -> Record | None:

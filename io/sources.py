@@ -1,6 +1,6 @@
 """Where a recording's bytes come from: a file, the files of a rosbag2 folder, a URL, a pipe."""
 
-import hashlib
+import contextlib
 import importlib.util
 import re
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from mcap.records import Attachment
 
 from ..factors.errors import LogError
 from .records import Record, RecordStream
-from .summary import Summary, find_attachment, read_summary
+from .summary import EMPTY, Summary, find_attachment, read_summary
 
 
 class Part:
@@ -28,7 +28,7 @@ class Part:
         self.path = path
         self._stream = stream
         self._records: RecordStream | None = None
-        self._open: list[BinaryIO] = []
+        self._hash: str | None = None
 
     @property
     def seekable(self) -> bool:
@@ -41,12 +41,15 @@ class Part:
         Raises:
             LogError: it cannot be read, or is no MCAP.
         """
-        size = self.path.stat().st_size if self.path is not None and self.seekable else None
-        self._records = RecordStream(self._opened(), self.label, size)
-        try:
-            yield from self._records
-        except (OSError, zstandard.ZstdError) as error:
-            raise LogError(f"{self.label}: cannot be read ({error}); copy it again") from error
+        with self._opened() as file:
+            size = self.path.stat().st_size if self.path is not None and self.seekable else None
+            self._records = RecordStream(file, self.label, size, self.summary().has_data_crc)
+            try:
+                yield from self._records
+                if self._stream is None:
+                    self._hash = self._records.sha256()
+            except (OSError, zstandard.ZstdError) as error:
+                raise LogError(f"{self.label}: cannot be read ({error}); copy it again") from error
 
     def warning(self) -> str | None:
         """What the last reading found damaged, in one line."""
@@ -55,7 +58,7 @@ class Part:
     def summary(self) -> Summary:
         """Descriptions from the end of a file, empty where there are none."""
         if not self.seekable or self.path is None:
-            return Summary({}, {}, {}, None)
+            return EMPTY
         with self.path.open("rb") as file:
             return read_summary(file)
 
@@ -70,32 +73,32 @@ class Part:
             raise _unreadable(self.label, error) from error
 
     def sha256(self) -> str:
-        """Hash of the file; of a stream that of all its bytes, what is left of it included."""
-        if self._records is not None:
-            return self._records.sha256()
-        if self.path is None:
-            return RecordStream(self._opened(), self.label).sha256()
-        with self.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
-    def close(self) -> None:
-        """Close what was opened here."""
-        for file in self._open:
-            file.close()
-        self._open.clear()
-
-    def _opened(self) -> BinaryIO:
+        """Hash of the (uncompressed) file; of a stream that of all its bytes, what is left of it included."""
         if self._stream is not None:
-            return self._stream
+            self._records = self._records or RecordStream(self._stream, self.label)
+            return self._records.sha256()
+        if self._hash is None:
+            with self._opened() as file:
+                self._hash = RecordStream(file, self.label).sha256()
+        return self._hash
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[BinaryIO]:
+        """A file is closed after use, a stream is left to whom it belongs."""
+        if self._stream is not None:
+            yield self._stream
+            return
         assert self.path is not None
         try:
             file = self.path.open("rb")
         except OSError as error:
             raise _unreadable(self.label, error) from error
-        self._open.append(file)
-        if self.path.suffix == ".zstd":
-            return cast(BinaryIO, zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True))
-        return file
+        with file:
+            if self.path.suffix == ".zstd":
+                with zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True) as stream:
+                    yield cast(BinaryIO, stream)
+            else:
+                yield file
 
 
 def parts_of(source: Path | str | BinaryIO) -> list[Part]:

@@ -1,7 +1,7 @@
 """What the end of a whole MCAP file says about it, and its attachments, without reading its messages."""
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import SEEK_END, BytesIO
 from typing import BinaryIO
 
@@ -12,6 +12,7 @@ from mcap.records import Attachment, Channel, Schema, Statistics
 from .records import MAGIC, PARSE_ERRORS, attachment_is_sound
 
 _FOOTER = 9 + 20 + len(MAGIC)
+_DATA_END = 9 + 4
 _MAXIMUM_SUMMARY = 1 << 28
 
 
@@ -24,11 +25,16 @@ class Summary:
     counts: dict[int, int]
     """Messages by channel."""
     statistics: Statistics | None
+    has_data_crc: bool = True
+    """Whether the writer gave a checksum over all records; True where that is not known."""
+
+
+EMPTY = Summary({}, {}, {}, None)
 
 
 def read_summary(file: BinaryIO) -> Summary:
     """The summary; empty where the file is cut or has none."""
-    summary = Summary({}, {}, {}, None)
+    summary = EMPTY
     size = file.seek(0, SEEK_END)
     if size < _FOOTER:
         return summary
@@ -36,11 +42,14 @@ def read_summary(file: BinaryIO) -> Summary:
     footer = file.read(_FOOTER)
     opcode, length, start = struct.unpack_from("<BQQ", footer)
     end = size - _FOOTER
-    if opcode != Opcode.FOOTER or length != 20 or not 0 < start <= end or end - start > _MAXIMUM_SUMMARY:
+    start = start or end  # 0: no summary
+    if opcode != Opcode.FOOTER or length != 20 or not _DATA_END <= start <= end or end - start > _MAXIMUM_SUMMARY:
         return summary
-    file.seek(start)
+    file.seek(start - _DATA_END)
+    data_end = file.read(_DATA_END)
+    has_crc = data_end[0] != Opcode.DATA_END or data_end[-4:] != bytes(4)
     try:
-        return _parsed(file.read(end - start))
+        return replace(_parsed(file.read(end - start)), has_data_crc=has_crc)
     except PARSE_ERRORS:
         return summary
 

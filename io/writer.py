@@ -70,13 +70,19 @@ class McapSink:
         self._closed = False
         with self._told():
             self._file = _Counting(self._create() if isinstance(target, str | Path) else target)
-            self._writer = Writer(
-                self._file,  # pyright: ignore[reportArgumentType]  # needs write, tell and flush, no more
-                compression=_COMPRESSION[compression],
-                chunk_size=chunk_size or 1,
-                use_chunking=chunk_size is not None,
-            )
-            self._writer.start(profile=profile, library="surecut")
+        self._writer = Writer(
+            self._file,  # pyright: ignore[reportArgumentType]  # needs write, tell and flush, no more
+            compression=_COMPRESSION[compression],
+            chunk_size=chunk_size or 1,
+            use_chunking=chunk_size is not None,
+            enable_data_crcs=chunk_size is None,  # chunks have checksums of their own
+        )
+        try:
+            with self._told():
+                self._writer.start(profile=profile, library="surecut")
+        except BaseException:
+            self.abort()
+            raise
 
     def write(self, topic: str, type_name: str, message: Any, log_time_ns: int) -> None:
         """Append one message (see `build`), of a type that `schemas.typestore` knows.

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..estimator.baseline import ClickedPoint
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Distance, Marker, Mount, Pipe, Pose, Rig
-from .measurement_level_machine import clicks, cloud_frames
+from .measurement_level_machine import clicks, cloud_frames, stereo_clicks
 from .measurement_level_mobile import marker_sightings, stereo_frames
 from .measurement_level_scenario import Scenario
 from .measurement_level_scene import Scene, build_scene, mobile_path
@@ -43,6 +44,8 @@ class Run:
     rig: Rig
     cameras: dict[str, CameraModel]
     truth: Truth
+    stereo_clicks: tuple[ClickedPoint, ...]
+    """Stereo depth at the clicks, for the paper's chain; the estimator does not get it."""
 
 
 def draw(scenario: Scenario, seed: int) -> Run:
@@ -57,7 +60,8 @@ def draw(scenario: Scenario, seed: int) -> Run:
     order = {StereoFrame: 0, MarkerSighting: 1, CloudFrame: 2, OutlineSighting: 3, Pick: 4}
     measurements.sort(key=lambda measurement: (measurement.stamp_ns, order[type(measurement)]))
     cameras = {name: _model(camera, scenario.baseline_m) for name, camera in world.nominal.items()}
-    return Run(tuple(measurements), world.rig, cameras, _truth(world))
+    picks = [measurement for measurement in measurements if isinstance(measurement, Pick)]
+    return Run(tuple(measurements), world.rig, cameras, _truth(world), tuple(stereo_clicks(world, picks)))
 
 
 def base_rig(scenario: Scenario, side: float, radius_m: float) -> Rig:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from ..estimator.baseline import ClickedPoint
+from ..estimator.pipes import EDGE_FLOOR_PX
 from ..factors.measurements import CloudFrame, OutlineSighting, Pick
 from ..factors.outline import outline_lines
 from .measurement_level_scene import cast, occluded
@@ -10,6 +12,8 @@ from .measurement_level_world import World, inside, project, spoil
 
 KINECT_FOCAL_PX = 585.0
 KINECT_SIZE = (640, 480)
+MATCH_SIGMA_PX = 0.25
+"""Disparity error of semi-global matching at a window's median."""
 
 
 def cloud_frames(world: World) -> list[CloudFrame]:
@@ -72,9 +76,37 @@ def clicks(world: World) -> list[Pick | OutlineSighting]:
     return found
 
 
+def stereo_clicks(world: World, picks: list[Pick]) -> list[ClickedPoint]:
+    """What a stereo matcher says under each click: the visible surface, with the calibration as given.
+
+    For the paper's chain only; the estimator is not given it.
+    """
+    return [_stereo_click(world, pick) for pick in picks]
+
+
+def _stereo_click(world: World, pick: Pick) -> ClickedPoint:
+    scenario, rng = world.scenario, world.rng
+    left, right = world.true.cameras["m_left"], world.true.cameras["m_right"]
+    w_T_m = world.w_T_m[world.stamps_ns.index(pick.stamp_ns)]
+    ray = w_T_m[:3, :3] @ np.linalg.solve(left.K, np.array([*pick.px, 1.0]))
+    distance, _, _ = cast(w_T_m[:3, 3], ray[None], world.scene)
+    if not np.isfinite(distance[0]):
+        return ClickedPoint(pick, None, "no surface under the click")
+    surface_w = w_T_m[:3, 3] + distance[0] * ray
+    seen, _ = project(right, w_T_m @ world.true.m_left_T_m_right, surface_w[None])
+    disparity_px = pick.px[0] - seen[0, 0] + rng.normal(0.0, MATCH_SIGMA_PX)
+    if disparity_px <= 0.5:
+        return ClickedPoint(pick, None, "no stereo depth at the click")
+    K = world.nominal["m_left"].K
+    depth_m = K[0, 0] * scenario.baseline_m / disparity_px
+    return ClickedPoint(pick, depth_m * np.linalg.solve(K, np.array([*pick.px, 1.0])))
+
+
 def _pick(world: World, stamp_ns: int, point_id: str, role: str, exact_px: Float) -> Pick:
     settings, rng = world.scenario.picks, world.rng
-    px = exact_px + rng.normal(0.0, settings.sigma_px * world.scenario.noise_factors.picks, 2)
+    # The model adds a floor to every click and every edge, and a campaign draws what the models say.
+    sigma_px = np.hypot(settings.sigma_px, world.rig.noise.pick_floor_px)
+    px = exact_px + rng.normal(0.0, sigma_px * world.scenario.noise_factors.picks, 2)
     if "picks" in world.scenario.outliers.families:
         px = spoil(px[None], world.scenario.outliers, rng)[0]
     covariance = settings.sigma_px**2 * np.eye(2)
@@ -94,7 +126,8 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
     noisy, feet, extents = np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2, 2))
     for i, line in enumerate(lines):
         feet[i] = pick_px - (line @ np.r_[pick_px, 1.0]) * line[:2]
-        shift, turn = rng.normal(0.0, sigmas * world.scenario.noise_factors.outlines)
+        spread = np.array([np.hypot(sigmas[0], EDGE_FLOOR_PX), sigmas[1]])
+        shift, turn = rng.normal(0.0, spread * world.scenario.noise_factors.outlines)
         if "outlines" in world.scenario.outliers.families and rng.random() < world.scenario.outliers.share:
             shift += rng.uniform(-1.0, 1.0) * world.scenario.outliers.size_px
         noisy[i] = _moved_line(line, feet[i], shift, turn)

@@ -129,7 +129,7 @@ def test_outline_factor(camera):
     values = gtsam.Values()
     a_pipe(values)
     values.insert(keys.keyframe(0), gtsam.Pose3.Expmap(RNG.normal(0, 0.1, 6)))
-    values.insert(keys.intrinsics(camera), gtsam.Cal3_S2(270, 272, 0, 180, 120))
+    values.insert(keys.intrinsics(camera), gtsam.Cal3DS2(270, 272, 0, 180, 120, 0, 0, 0, 0))
     if camera == "m_right":
         values.insert(keys.extrinsics(camera), gtsam.Pose3.Expmap(np.array([0.01, 0, 0.02, 0.15, 0, 0])))
     line = np.array([0.995, 0.0998, -170.0])

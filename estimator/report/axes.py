@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi
 
-from ..region_probability import ball_probability
 from ..result import PointEstimate
 
 Float = NDArray[np.float64]
 
-COVERAGE = 0.95
-K3 = float(chi.ppf(COVERAGE, 3))
+K3 = float(chi.ppf(0.95, 3))
 """Coverage factor of a 3-D region, 2.80: what 1.96 is for a single number."""
 
 
@@ -41,7 +39,8 @@ class HalfAxis:
 def triad(point: PointEstimate) -> Triad:
     """Along the pipe's axis, across it, and the part of the line of sight from {b} that is perpendicular to it.
 
-    Without a pipe: right, down and forward of the machine's camera.
+    Signs are such that in the machine's image an upright pipe points up and across points right; for a pipe that lies
+    it is the other way round. Without a pipe: right, down and forward of the machine's camera.
     """
     if point.axis is None or not np.isfinite(point.axis).all() or np.linalg.norm(point.axis) < 1e-9:
         return Triad(("right", "down", "forward"), np.eye(3))
@@ -51,7 +50,17 @@ def triad(point: PointEstimate) -> Triad:
     if np.linalg.norm(depth) < 1e-6:
         depth = np.eye(3)[0] - along[0] * along
     depth /= np.linalg.norm(depth)
-    return Triad(("along", "across", "depth"), np.stack([along, np.cross(along, depth), depth]))
+    across = np.cross(depth, along)
+    first, second = (along, across) if is_upright(along) else (across, along)
+    up = first if first[1] < 0 else -first
+    right = second if second[0] > 0 else -second
+    rows = (up, right, depth) if is_upright(along) else (right, up, depth)
+    return Triad(("along", "across", "depth"), np.array(rows, dtype=np.float64))
+
+
+def is_upright(axis: Float) -> bool:
+    """Whether a direction is nearer to the vertical than to the horizontal of the machine's image."""
+    return bool(abs(axis[1]) >= abs(axis[0]))
 
 
 def half_axes(point: PointEstimate, directions: Triad) -> tuple[HalfAxis, ...]:
@@ -70,13 +79,3 @@ def half_axes(point: PointEstimate, directions: Triad) -> tuple[HalfAxis, ...]:
         )
         for i in order
     )
-
-
-def radius95(covariance_m2: Float) -> float:
-    """Radius [m] of the sphere that holds the truth with 95 %, by bisection."""
-    largest = float(np.sqrt(np.linalg.eigvalsh(covariance_m2)[-1]))
-    low, high = 1.9 * largest, 2.9 * largest
-    while high - low > 1e-6 * high:
-        middle = (low + high) / 2
-        low, high = (low, middle) if ball_probability(covariance_m2, middle) >= COVERAGE else (middle, high)
-    return high

@@ -29,8 +29,8 @@ class Banner:
     """None: no cut plan asks for one."""
     word: str
     headline: str
-    number: str
-    """The number that decided, with what is required."""
+    figures: tuple[tuple[str, str], ...]
+    """Key figures: what, and its value."""
     details: tuple[str, ...]
     sign: Figure
 
@@ -43,8 +43,8 @@ class Table:
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     numeric: tuple[int, ...] = ()
-    total: bool = False
-    """The last row is a sum."""
+    total: int = 0
+    """Number of rows at the end that sum up."""
     widths: tuple[float, ...] = ()
     """Shares of the width; none: even."""
 

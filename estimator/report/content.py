@@ -5,24 +5,45 @@ from ..decision import Decision, decide, percent
 from ..result import Result
 from ..validated_range import ValidatedRange
 from .blocks import Block, Document, Heading, Paragraph, Table
-from .essentials import banner, point_pages
+from .essentials import banner, detail_pages, point_pages
 from .evidence import evidence_pages
+from .glossary import TERMS
 from .text import mm, utc
 
 TITLE = "Uncertainty report for cut safety"
 
 
-def build_document(result: Result, rig: Rig, validated: ValidatedRange | None, sha256: str) -> Document:
-    """The whole report. `sha256` is the result's own hash, printed on every page."""
+def build_document(
+    result: Result, rig: Rig, validated: ValidatedRange | None, sha256: str, plan: str | None = None
+) -> Document:
+    """The whole report.
+
+    Args:
+        sha256: the result's own hash, printed on every page.
+        plan: name of the rig file that the cut plan was taken from, where that is not the result's own.
+    """
     decisions = decide(result, rig, validated)
+    log = result.provenance.get("log_sha256", "")
     version = result.provenance.get("surecut", "")
-    blocks = (*_opening(result, decisions), *_points(result, decisions), *evidence_pages(result, validated))
+    other_plan = (Paragraph(f"Cut plan from {plan}, not from the rig in the result."),) if plan else ()
+    blocks = (
+        *other_plan,
+        *_opening(result, decisions),
+        *_points(result, decisions),
+        *evidence_pages(result, validated),
+        *_glossary(),
+    )
     return Document(
         title=TITLE,
         subtitle=f"Recording up to {utc(result.end_ns)}",
-        footer=f"surecut {version} · result {sha256[:16]} · log {result.provenance.get('log_sha256', '')[:16]}",
+        footer=f"surecut {version} · result {sha256[:16]} · log {log[:16]}",
         blocks=blocks,
     )
+
+
+def _glossary() -> tuple[Block, ...]:
+    table = Table("In plain words.", ("word", "meaning"), TERMS, widths=(0.28, 0.72))
+    return Heading("Words", 1, new_page=True), table
 
 
 def _opening(result: Result, decisions: tuple[Decision, ...]) -> list[Block]:
@@ -75,4 +96,6 @@ def _points(result: Result, decisions: tuple[Decision, ...]) -> list[Block]:
     blocks: list[Block] = []
     for index, (point, decision) in enumerate(entries):
         blocks += point_pages(result, point, decision, first=index == 0)
+    for index, (point, _) in enumerate(entries):
+        blocks += detail_pages(result, point, first=index == 0)
     return blocks

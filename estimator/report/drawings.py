@@ -1,6 +1,6 @@
 """The report's figures: verdict sign, three views, bars of the budget, acceptance intervals."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Unpack
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...factors.rig import Cut
 from ..decision import Verdict, along_room_m
 from ..result import FamilyConsistency, PointEstimate
-from .axes import K3, Triad, triad
+from .axes import K3, Triad, is_upright, triad
 from .figure import Figure, Label, Path, Stroke, Style, clipped, ellipse, line, rectangle
 from .text import significant
 
@@ -60,22 +60,24 @@ def three_views(point: PointEstimate, cut: Cut | None) -> Figure:
     directions = triad(point)
     measured = directions.turned(point.covariance_m2)
     total = measured + (cut.tool_sigma_m**2 if cut else 0.0) * np.eye(3)
-    pipe = point.axis is not None
-    views = (
-        View("As the machine sees it", 1, 0) if pipe else View("As the machine sees it", 0, 1, -1),
-        View("From the side", 2, 0) if pipe else View("From the side", 2, 1, -1),
-        View("Along the pipe" if pipe else "From above", 1, 2) if pipe else View("From above", 0, 2),
-    )
     room = max(along_room_m(cut), cut.tolerance_across_m) if cut else 0.0
     extent = 1.15 * max(room, K3 * float(np.sqrt(np.diag(total).max())), 1e-6)
-    size = 150.0
+    size = 134.0
     strokes: list[Stroke] = []
-    for index, view in enumerate(views):
+    for index, view in enumerate(_views(directions)):
         x = index * (WIDTH - size) / 2
         strokes += _panel(view, directions, measured, total, cut, (x, 16.0), size, extent)
     strokes += _scale_bar(extent, size, 16 + size + 14)
     strokes += _key(cut, 16 + size + 14)
     return Figure(WIDTH, size + 42, tuple(strokes), f"Uncertainty of {point.id} in three views, to scale")
+
+
+def _views(directions: Triad) -> tuple[View, View, View]:
+    if directions.names[0] != "along":
+        return View("As the machine sees it", 0, 1, -1), View("From the side", 2, 1, -1), View("From above", 0, 2)
+    if is_upright(directions.rows[0]):
+        return View("As the machine sees it", 1, 0), View("From the side", 2, 0), View("Along the pipe", 1, 2)
+    return View("As the machine sees it", 0, 1), View("From above", 0, 2), View("Along the pipe", 2, 1)
 
 
 def _panel(
@@ -97,18 +99,29 @@ def _panel(
         Label(x, y - 5, view.title, 8.5, bold=True),
         rectangle(x, y, size, size, pen=0.5, grey=MIDDLE),
     ]
-    if cut is not None:
-        strokes += _tolerance(view, directions, cut, centre, scale, (x, y, size))
+    tolerance = [] if cut is None else _tolerance(view, directions, cut, centre, scale, (x, y, size))
+    strokes += tolerance
     for covariance, style in ((total, WITH_TOOL), (measured, MEASURED)):
         curve = ellipse(centre, flip @ (covariance[pick] * scale**2) @ flip.T, K3, **style)
         kept = clipped(curve, x, y, size, size)
         strokes += [kept] if kept is not None else []
+    # Again without its fill, so that a region larger than the tolerance does not hide it.
+    strokes += [replace(stroke, fill=None) for stroke in tolerance]
     cx, cy = centre
     strokes += [line(cx - 4, cy, cx + 4, cy, pen=0.9), line(cx, cy - 4, cx, cy + 4, pen=0.9)]
-    strokes.append(Label(x + size - 3, y + size - 4, f"{directions.names[view.right]} →", 7.5, "end", italic=True))
-    arrow = "↑" if view.up_sign > 0 else "↓"
-    strokes.append(Label(x + 3, y + 9, f"{arrow} {directions.names[view.up]}", 7.5, italic=True))
+    right, up = directions.names[view.right], directions.names[view.up]
+    strokes += [Label(x + size - 16, y + size - 4, right, 7.5, "end", italic=True)]
+    strokes += _arrow((x + size - 13, y + size - 6.5), (10, 0))
+    strokes += [Label(x + 9, y + 10, up, 7.5, italic=True)]
+    strokes += _arrow((x + 5, y + 13), (0, -10)) if view.up_sign > 0 else _arrow((x + 5, y + 3), (0, 10))
     return strokes
+
+
+def _arrow(start: tuple[float, float], step: tuple[float, float]) -> list[Stroke]:
+    tail, way = np.array(start), np.array(step)
+    head, side = tail + way, 0.22 * np.array([-way[1], way[0]])
+    barbs = np.stack([head - 0.4 * way + side, head, head - 0.4 * way - side])
+    return [Path(np.stack([tail, head]), pen=0.7), Path(barbs, pen=0.7)]
 
 
 def _tolerance(
@@ -118,14 +131,15 @@ def _tolerance(
     centre: tuple[float, float],
     scale: float,
     frame: tuple[float, float, float],
-) -> list[Stroke]:
+) -> list[Path]:
     """The tolerance region's outline: a disc along the pipe, a rectangle from the side, a ball without an axis."""
     along, across = max(along_room_m(cut), 0.0) * scale, cut.tolerance_across_m * scale
     if directions.names[0] != "along":
         radius = min(along, across)
         shape = ellipse(centre, np.eye(2) * radius**2, 1.0, **TOLERANCE)
     elif 0 in (view.right, view.up):
-        shape = rectangle(centre[0] - across, centre[1] - along, 2 * across, 2 * along, **TOLERANCE)
+        wide, high = (along, across) if view.right == 0 else (across, along)
+        shape = rectangle(centre[0] - wide, centre[1] - high, 2 * wide, 2 * high, **TOLERANCE)
     else:
         shape = ellipse(centre, np.eye(2) * across**2, 1.0, **TOLERANCE)
     kept = clipped(shape, frame[0], frame[1], frame[2], frame[2])
@@ -158,7 +172,7 @@ def _key(cut: Cut | None, y: float) -> list[Stroke]:
 
 def budget_bars(shares: list[tuple[str, float]], title: str) -> Figure:
     """Horizontal bars of the share of each source in the total variance, largest first; a share may be negative."""
-    row, left = 15.0, 150.0
+    row, left = 13.5, 150.0
     room = WIDTH - left - 60
     largest = max([abs(share) for _, share in shares] or [1.0]) or 1.0
     strokes: list[Stroke] = [line(left, 0, left, row * len(shares), pen=0.6)]
@@ -167,15 +181,19 @@ def budget_bars(shares: list[tuple[str, float]], title: str) -> Figure:
         width = max(abs(share) / largest * room, 0.4)
         fill = 0.35 if share >= 0 else 1.0
         strokes += [
-            Label(left - 6, y + 10.5, name, 8.5, "end"),
+            Label(left - 6, y + 9.8, shortened(name), 8.5, "end"),
             rectangle(left, y + 2.5, width, row - 5, pen=0.6, grey=0.2, fill=fill),
-            Label(left + width + 5, y + 10.5, f"{significant(share * 100)} %", 8.5),
+            Label(left + width + 5, y + 9.8, f"{significant(share * 100)} %", 8.5),
         ]
     return Figure(WIDTH, row * len(shares) + 2, tuple(strokes), title)
 
 
-def acceptance_intervals(families: tuple[FamilyConsistency, ...]) -> Figure:
-    """Chi-square per degree of freedom of each family against its limits, on a logarithmic scale about 1."""
+def acceptance_intervals(all_families: tuple[FamilyConsistency, ...]) -> Figure:
+    """Chi-square per degree of freedom of each family against its limits, on a logarithmic scale about 1.
+
+    A family without a degree of freedom of its own can neither agree nor disagree and is left out.
+    """
+    families = [family for family in all_families if np.isfinite(_ratio(family))]
     row, left = 16.0, 150.0
     room = WIDTH - left - 70
     values = [_ratio(family) for family in families]
@@ -194,19 +212,24 @@ def acceptance_intervals(families: tuple[FamilyConsistency, ...]) -> Figure:
     ]
     for index, (family, value) in enumerate(zip(families, values, strict=True)):
         y = index * row + row / 2
-        inside = family.lower <= value <= family.upper
+        word = "ABOVE" if value > family.upper else "below" if value < family.lower else "within"
         lower, upper = at(family.lower), at(family.upper)
         strokes += [
-            Label(left - 6, y + 3, family.family, 8.5, "end"),
+            Label(left - 6, y + 3, shortened(family.family), 8.5, "end"),
             rectangle(lower, y - 3.5, max(upper - lower, 0.6), 7, pen=0.6, grey=0.4, fill=LIGHT),
-            Path(_diamond(at(value), y, 4.0), closed=True, fill=0.0 if inside else 1.0, pen=1.2),
-            Label(WIDTH, y + 3, "within" if inside else "OUTSIDE", 8.5, "end", bold=not inside),
+            Path(_diamond(at(value), y, 4.0), closed=True, fill=1.0 if word == "ABOVE" else 0.0, pen=1.2),
+            Label(WIDTH, y + 3, word, 8.5, "end", bold=word == "ABOVE"),
         ]
     return Figure(WIDTH, height + 12, tuple(strokes), "Chi-square per degree of freedom against its limits")
 
 
+def shortened(name: str, letters: int = 36) -> str:
+    """A label that fits beside a bar."""
+    return name if len(name) <= letters else f"{name[: letters - 1]}…"
+
+
 def _ratio(family: FamilyConsistency) -> float:
-    return family.chi2 / family.dof if family.dof > 0 else float("nan")
+    return family.chi2 / family.dof if family.dof > 1e-6 else float("nan")
 
 
 def _diamond(x: float, y: float, radius: float) -> Float:
@@ -235,8 +258,8 @@ def sigma_bars(rows: list[tuple[str, float]], title: str) -> Figure:
         shown = value if np.isfinite(value) else 0.0
         start, width = (zero, shown * scale) if shown >= 0 else (zero + shown * scale, -shown * scale)
         strokes += [
-            Label(left - 6, y + 10.5, name, 8.5, "end"),
+            Label(left - 6, y + 9.8, shortened(name), 8.5, "end"),
             rectangle(start, y + 3, max(width, 0.5), row - 6, pen=0.6, grey=0.2, fill=0.35 if abs(shown) <= 3 else 0.0),
-            Label(WIDTH, y + 10.5, f"{significant(value)} σ", 8.5, "end", bold=abs(shown) > 3),
+            Label(WIDTH, y + 9.8, f"{significant(value)} σ", 8.5, "end", bold=abs(shown) > 3),
         ]
     return Figure(WIDTH, height + 12, tuple(strokes), title)

@@ -11,31 +11,46 @@ from .axes import K3, Triad, half_axes, triad
 from .blocks import Banner, Block, Drawing, Gallery, Heading, Paragraph, Table
 from .drawings import budget_bars, three_views, verdict_sign
 from .pick_figure import pick_figure
-from .text import decimals, duration, fixed, mm, mm_with, significant, utc
+from .text import decimals, duration, fixed, mm, mm_with, utc
 
 Float = NDArray[np.float64]
 
 NO_VERDICT = "NO VERDICT"
-ADVICE_SHOWN = 6
+ADVICE_SHOWN = 5
+BARS_SHOWN = 8
 VIEWS_SHOWN = 4
 
 
 def point_pages(result: Result, point: PointEstimate, decision: Decision | None, first: bool) -> Iterator[Block]:
-    """Everything about one point: verdict, place, views, budget, advice, images."""
-    role = f" ({point.role})" if point.role else ""
-    yield Heading(f"Point {point.id}{role}", 1, new_page=not first)
+    """One page about a point: verdict, place, views, what limits it, what to do next."""
+    yield Heading(heading(point), 1, new_page=not first)
     yield banner(point.id, decision, result)
-    if not _drawable(point):
+    if not drawable(point):
         yield Paragraph("No region can be drawn: the covariance is not finite or singular.")
         return
     yield Heading("Where")
-    directions = triad(point)
     yield _position(point)
     yield Drawing(three_views(point, decision.cut if decision else None), _views_caption(decision))
-    yield _ellipsoid(point, directions)
-    yield from _budget(point, directions)
+    yield Heading("What limits it")
+    yield from _budget_chart(point)
+    yield Heading("What to do next")
     yield from _advice(result, point)
+
+
+def detail_pages(result: Result, point: PointEstimate, first: bool) -> Iterator[Block]:
+    """The numbers behind the page: ellipsoid, budget as a table, images."""
+    if not drawable(point):
+        return
+    directions = triad(point)
+    yield Heading(f"{heading(point)}: the numbers behind it", 1, new_page=first)
+    yield _ellipsoid(point, directions)
+    yield from _budget_table(point, directions)
     yield from _images(result, point)
+
+
+def heading(point: PointEstimate) -> str:
+    """`Point P1 (cut)`."""
+    return f"Point {point.id} ({point.role})" if point.role else f"Point {point.id}"
 
 
 def banner(point_id: str, decision: Decision | None, result: Result) -> Banner:
@@ -46,20 +61,35 @@ def banner(point_id: str, decision: Decision | None, result: Result) -> Banner:
             verdict=None,
             word=NO_VERDICT,
             headline=f"The cut plan has no entry for {point_id}: without tolerances there is no permission to cut.",
-            number="",
+            figures=(),
             details=(),
             sign=verdict_sign(None),
         )
-    chance = "cannot be stated" if decision.probability is None else percent(decision.probability)
     return Banner(
         point=point_id,
         verdict=decision.verdict,
         word=decision.verdict,
         headline=decision.headline,
-        number=f"All limits kept, tool included: probability {chance}. Required: {percent(decision.required)}.",
+        figures=tuple(_figures(decision)),
         details=tuple(_details(decision, result)),
         sign=verdict_sign(decision.verdict),
     )
+
+
+def _figures(decision: Decision) -> Iterator[tuple[str, str]]:
+    chance = "cannot be stated" if decision.probability is None else percent(decision.probability)
+    yield (
+        ("all limits kept, were it not for the doubts" if decision.blockers else "all limits kept, tool included"),
+        chance,
+    )
+    yield "required", percent(decision.required)
+    yield "with a perfect measurement", percent(decision.tool_only)
+    if decision.blockers or decision.margin is None:
+        return
+    if decision.margin >= 1:
+        yield "reserve of uncertainty", f"factor {np.floor(decision.margin * 100) / 100:.2f}"
+    else:
+        yield "uncertainty must fall to", _percent_of(decision.margin)
 
 
 def _details(decision: Decision, result: Result) -> Iterator[str]:
@@ -67,18 +97,11 @@ def _details(decision: Decision, result: Result) -> Iterator[str]:
     for blocker in decision.blockers[1:] if decision.verdict == "MEASURE MORE" else decision.blockers:
         yield f"Also: {blocker}."
     for requirement in decision.requirements:
-        yield f"{percent(requirement.probability)}: {requirement.text}."
-    if decision.margin is not None and decision.margin >= 1:
-        yield f"Reserve: the measurement may be up to {significant(decision.margin, 3)} times as uncertain."
-    elif decision.margin is not None:
-        yield (
-            f"Lacking: the measurement's uncertainty has to come down to {_percent_of(decision.margin)} of what it is."
-        )
-    yield f"With a perfect measurement, tool and robot alone would hold it with {percent(decision.tool_only)}."
+        yield f"{requirement.text[:1].upper()}{requirement.text[1:]}: kept with {percent(requirement.probability)}."
     if decision.expires_ns is not None and result.last_board_view_ns is not None:
         age = duration((result.end_ns - result.last_board_view_ns) * 1e-9)
-        end = utc(decision.expires_ns)
-        yield f"Board last seen {age} before the end of the recording; any permission ends at {end}."
+        ends = "ends" if decision.expires_ns >= result.end_ns else "ended"
+        yield f"Board last seen {age} before the end of the recording; permission {ends} at {utc(decision.expires_ns)}."
     yield from decision.notes
 
 
@@ -86,7 +109,8 @@ def _percent_of(factor: float) -> str:
     return f"{np.floor(factor * 1000) / 10:.3g} %"
 
 
-def _drawable(point: PointEstimate) -> bool:
+def drawable(point: PointEstimate) -> bool:
+    """Whether there is a finite region at all."""
     if not (np.isfinite(point.covariance_m2).all() and np.isfinite(point.position_m).all()):
         return False
     return bool(np.linalg.eigvalsh(point.covariance_m2)[-1] > 0)
@@ -98,8 +122,8 @@ def _position(point: PointEstimate) -> Table:
     row = (*cells, mm(point.radius95_m), str(point.measurements))
     return Table(
         caption=(
-            f"Position in {{{point.frame}}}, the optical frame of the machine's depth camera. Expanded uncertainty "
-            f"U = {K3:.2f} u, the coverage factor for 95 % in three dimensions."
+            f"Position in {{{point.frame}}}, the machine's depth camera. Expanded uncertainty with k = {K3:.2f}: "
+            f"95 % in three dimensions."
         ),
         header=("x (right)", "y (down)", "z (forward)", "95 % within a sphere of", "measurements"),
         rows=(row,),
@@ -132,41 +156,63 @@ def budget_rows(point: PointEstimate) -> list[tuple[str, Float]]:
     return sorted(point.budget.items(), key=lambda item: (-float(np.trace(item[1])), item[0]))
 
 
+def family_shares(point: PointEstimate) -> dict[str, float]:
+    """Variance [m²], summed over the three directions, by family: what stands before the colon of a source's name."""
+    shares: dict[str, float] = {}
+    for name, part in budget_rows(point):
+        family = name.partition(":")[0]
+        shares[family] = shares.get(family, 0.0) + float(np.trace(part))
+    return shares
+
+
 def budget_closure(point: PointEstimate) -> float:
     """Largest deviation of the budget's sum from the covariance, relative to the covariance's largest entry."""
     total = np.sum([part for _, part in budget_rows(point)], axis=0) if point.budget else np.zeros((3, 3))
     return float(np.abs(total - point.covariance_m2).max() / np.abs(point.covariance_m2).max())
 
 
-def _budget(point: PointEstimate, directions: Triad) -> Iterator[Block]:
-    yield Heading("What it is made of")
+def _budget_chart(point: PointEstimate) -> Iterator[Block]:
     if not point.budget:
         yield Paragraph("The result holds no uncertainty budget for this point.")
         return
     total = float(np.trace(point.covariance_m2))
-    rows = budget_rows(point)
-    places = decimals(float(np.sqrt(total)) * 1e3) + 1
-    table = [
-        (name, *(_root(v, places) for v in np.diag(directions.turned(part))), f"{np.trace(part) / total * 100:.1f} %")
-        for name, part in rows
-    ]
-    sums = np.diag(directions.turned(point.covariance_m2))
-    table.append(("Combined standard uncertainty", *(_root(v, places) for v in sums), "100.0 %"))
-    yield Table(
-        caption="Uncertainty budget: standard uncertainty in mm by direction. The squares add up to the last row's.",
-        header=("Source", *directions.names, "share of the variance"),
-        rows=tuple(table),
-        numeric=(1, 2, 3, 4),
-        total=True,
-        widths=(0.4, 0.15, 0.15, 0.15, 0.15),
-    )
-    shares = [(name, float(np.trace(part)) / total) for name, part in rows]
-    yield Drawing(
-        budget_bars(shares, f"Uncertainty budget of {point.id}"), "Share of each source in the total variance."
-    )
+    families = sorted(family_shares(point).items(), key=lambda item: (-item[1], item[0]))
+    shares = [(name, trace / total) for name, trace in families[:BARS_SHOWN]]
+    if len(families) > BARS_SHOWN:
+        rest = sum(trace for _, trace in families[BARS_SHOWN:]) / total
+        shares.append((f"{len(families) - BARS_SHOWN} more", rest))
+    bars = budget_bars(shares, f"Uncertainty budget of {point.id}")
+    yield Drawing(bars, "Share of each source in the total variance of the measured point.")
     closure = budget_closure(point)
     if closure > 1e-9:
         yield Paragraph(f"The budget does not add up: it misses the covariance by {closure:.1g} of its size.")
+
+
+def _budget_table(point: PointEstimate, directions: Triad) -> Iterator[Block]:
+    if not point.budget:
+        return
+    total = float(np.trace(point.covariance_m2))
+    places = decimals(float(np.sqrt(total)) * 1e3) + 1
+    table = [
+        (name, *(_root(v, places) for v in np.diag(directions.turned(part))), _share(float(np.trace(part)) / total))
+        for name, part in budget_rows(point)
+    ]
+    sums = np.diag(directions.turned(point.covariance_m2))
+    table.append(("combined standard uncertainty", *(_root(v, places) for v in sums), "100.0 %"))
+    expanded = (fixed(K3 * float(np.sqrt(max(v, 0.0))) * 1e3, places) for v in sums)
+    table.append((f"expanded, k = {K3:.2f}", *expanded, ""))
+    yield Table(
+        caption="Uncertainty budget: standard uncertainty in mm by direction. The squares add up.",
+        header=("source", *directions.names, "share of variance"),
+        rows=tuple(table),
+        numeric=(1, 2, 3, 4),
+        total=2,
+        widths=(0.4, 0.14, 0.14, 0.14, 0.18),
+    )
+
+
+def _share(share: float) -> str:
+    return f"{share * 100:.1f} %" if abs(share) >= 5e-4 or share == 0 else "below 0.1 %"
 
 
 def _root(variance: float, places: int) -> str:
@@ -176,13 +222,12 @@ def _root(variance: float, places: int) -> str:
 
 
 def _advice(result: Result, point: PointEstimate) -> Iterator[Block]:
-    yield Heading("What to do next")
     advice = result.advice.get(point.id, ())
     if not advice:
         yield Paragraph("The result names no further measurement for this point.")
         return
     rows = tuple(
-        (a.action, a.detail, f"{mm(point.radius95_m)} → {mm(a.predicted_radius95_m)}", f"{max(a.gain, 0) * 100:.0f} %")
+        (a.action, a.detail, f"{mm(point.radius95_m)} to {mm(a.predicted_radius95_m)}", f"{max(a.gain, 0) * 100:.0f} %")
         for a in advice[:ADVICE_SHOWN]
     )
     yield Table(
@@ -198,7 +243,6 @@ def _images(result: Result, point: PointEstimate) -> Iterator[Block]:
     views = [view for view in result.pick_views if view.point_id == point.id]
     if not views:
         return
-    yield Heading("In the images")
     shown = tuple(Drawing(pick_figure(view), _view_caption(view)) for view in views[:VIEWS_SHOWN])
     yield Gallery(shown)
     if len(views) > VIEWS_SHOWN:

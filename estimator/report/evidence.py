@@ -5,13 +5,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..result import CalibrationEstimate, DistanceEstimate, Result
+from ..result import CalibrationEstimate, DistanceEstimate, FamilyConsistency, Result
 from ..validated_range import QUANTITIES, ValidatedRange, quantities
 from .blocks import Block, Drawing, Heading, Paragraph, Table
 from .drawings import acceptance_intervals, sigma_bars
 from .text import duration, mm_with, significant, utc, with_sigma
 
 REASONS_SHOWN = 40
+MOVED_SHOWN = 8
+DOF_LEAST = 1e-6
+"""A family with fewer degrees of freedom has nothing to be tested with."""
 
 
 def evidence_pages(result: Result, validated: ValidatedRange | None) -> Iterator[Block]:
@@ -32,13 +35,15 @@ def _consistency(result: Result) -> Iterator[Block]:
     consistency = result.consistency
     yield Heading("Does the model agree with its own data?")
     if consistency.passed:
-        yield Paragraph("Yes. Every family of measurements scatters as much as its stated uncertainty says.")
+        low = [f.family for f in consistency.by_family if f.dof > DOF_LEAST and f.chi2 / f.dof < f.lower]
+        more = f" Less than stated, so stated with caution: {', '.join(low)}." if low else ""
+        yield Paragraph(f"Yes. No family of measurements scatters more than its stated uncertainty allows.{more}")
     else:
-        yield Paragraph("NO. " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
+        yield Paragraph("NO: " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
     if not consistency.by_family:
         return
     rows = tuple(
-        (f.family, f"{f.chi2:.1f}", f"{f.dof:.1f}", _ratio(f.chi2, f.dof), f"{f.lower:.3g} to {f.upper:.3g}",
+        (f.family, f"{f.chi2:.1f}", f"{f.dof:.1f}", _ratio(f.chi2, f.dof), _limits(f),
          str(f.residuals), str(f.downweighted))
         for f in consistency.by_family
     )  # fmt: skip
@@ -48,7 +53,7 @@ def _consistency(result: Result) -> Iterator[Block]:
         header=("Family", "chi²", "degrees of freedom", "ratio", "limits of the ratio", "residuals", "softened"),
         rows=(*rows, (*total, "", "", "")),
         numeric=(1, 2, 3, 4, 5, 6),
-        total=True,
+        total=1,
         widths=(0.28, 0.12, 0.14, 0.09, 0.15, 0.11, 0.11),
     )
     yield Drawing(
@@ -57,8 +62,12 @@ def _consistency(result: Result) -> Iterator[Block]:
     )
 
 
+def _limits(family: FamilyConsistency) -> str:
+    return f"{family.lower:.3g} to {family.upper:.3g}" if np.isfinite(family.upper) else ""
+
+
 def _ratio(chi2: float, dof: float) -> str:
-    return significant(chi2 / dof, 3) if dof > 0 else "none"
+    return significant(chi2 / dof, 3) if dof > DOF_LEAST else "not testable"
 
 
 def _paths(result: Result) -> Iterator[Block]:

@@ -55,11 +55,11 @@ def _block(block: Block) -> str:
 
 def _banner(banner: Banner) -> str:
     details = "".join(f"<li>{escape(detail)}</li>" for detail in banner.details)
-    number = f'<p class="number">{escape(banner.number)}</p>' if banner.number else ""
+    figures = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in banner.figures)
     return (
         f'<section class="verdict" data-point="{escape(banner.point)}" data-verdict="{escape(banner.word)}">'
         f'<div class="sign">{svg(banner.sign)}</div><div><p class="word">{escape(banner.word)}</p>'
-        f'<p class="headline">{escape(banner.headline)}</p>{number}'
+        f'<p class="headline">{escape(banner.headline)}</p><dl>{figures}</dl>'
         f"<ul>{details}</ul></div></section>"
     )
 
@@ -72,11 +72,12 @@ def _table(table: Table) -> str:
     columns = "".join(f'<col style="width:{width * 100:.4g}%">' for width in table.widths)
     header = "".join(cell("th", i, text) for i, text in enumerate(table.header))
     rows = [f"<tr>{''.join(cell('td', i, text) for i, text in enumerate(row))}</tr>" for row in table.rows]
-    total = f"<tfoot>{rows.pop()}</tfoot>" if table.total and rows else ""
+    body, foot = rows[: len(rows) - table.total], rows[len(rows) - table.total :]
+    total = f"<tfoot>{''.join(foot)}</tfoot>" if foot else ""
     head = f"<thead><tr>{header}</tr></thead>" if any(table.header) else ""
     return (
         f"<table><caption>{escape(table.caption)}</caption><colgroup>{columns}</colgroup>"
-        f"{head}<tbody>{''.join(rows)}</tbody>{total}</table>"
+        f"{head}<tbody>{''.join(body)}</tbody>{total}</table>"
     )
 
 

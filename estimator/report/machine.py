@@ -10,7 +10,7 @@ from ..decision import Decision, decide
 from ..result import PointEstimate, Result
 from ..validated_range import ValidatedRange, quantities
 from .axes import K3, half_axes, triad
-from .essentials import NO_VERDICT, budget_closure
+from .essentials import NO_VERDICT, budget_closure, drawable
 
 FORMAT = 1
 
@@ -79,7 +79,7 @@ def _point(point: PointEstimate, result: Result, planned: bool) -> dict[str, Any
             for a in result.advice.get(point.id, ())
         ],
     }
-    if np.isfinite(point.covariance_m2).all() and np.isfinite(point.position_m).all():
+    if drawable(point):
         directions = triad(point)
         data["directions"] = dict(zip(directions.names, directions.rows.tolist(), strict=True))
         data["half_axes_m"] = [axis.length_m for axis in half_axes(point, directions)]

@@ -90,7 +90,7 @@ class CloudFrontEnd:
         keep = weight.sum(axis=1) >= self._config.valid_share * self._window**2
         weight = weight[keep]
         x, y = self._x[keep], self._y[keep]
-        value = weight / self._tiles(depth)[keep]
+        value = np.divide(weight, self._tiles(depth)[keep], out=np.zeros_like(weight), where=weight > 0)
         return _plane_fits(x, y, value, weight, self._window)
 
     def _samples(self, stamp_ns: int, fit: _Windows, averaged: int) -> CloudFrame:
@@ -127,7 +127,7 @@ def trusted_pixels(depth_m: Float32, camera: CameraModel, noise: DepthNoise) -> 
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     near, far = cv2.erode(depth, cross), cv2.dilate(depth, cross)
     steepest = np.float32(np.tan(np.deg2rad(80.0)) * 2.0 / camera.fx)
-    limit = 3 * noise.axial(far, np.zeros_like(far)).astype(np.float32) + steepest * far
+    limit = 3 * noise.axial(far, 0.0) + steepest * far
     edge = ((far - near) > limit).astype(np.uint8)
     grow = 2 * int(np.ceil(noise.lateral_px)) - 1
     edge = cv2.dilate(edge, np.ones((grow, grow), np.uint8)) if grow > 1 else edge
@@ -154,7 +154,7 @@ def average_depth(depths_m: Float32, share: float = 0.5) -> Float32:
 def _plane_fits(x: Float32, y: Float32, value: Float32, weight: Float32, window: int) -> _Windows:
     """Least-squares planes value = a x + b y + c of every row; `value` is weighted already."""
     count = weight.sum(axis=1)
-    mx, my, mv = ((weight * a).sum(axis=1) / count for a in (x, y, np.where(weight > 0, value, 0)))
+    mx, my, mv = ((weight * a).sum(axis=1) / count for a in (x, y, value))
     dx, dy = (x - mx[:, None]) * weight, (y - my[:, None]) * weight
     dv = np.where(weight > 0, value - mv[:, None], np.float32(0))
     xx, xy, yy = ((a * b).sum(axis=1, dtype=np.float64) for a, b in ((dx, dx), (dx, dy), (dy, dy)))

@@ -26,7 +26,7 @@ _MESSAGE_STEP_M = 0.001
 class DepthNoise:
     """Noise of one depth camera model; `z` in metres, `theta` the angle between ray and surface normal in rad."""
 
-    axial: Callable[[Float, Float], Float]
+    axial: Callable[[Float, Float | float], Float]
     """Standard deviation of a pixel's depth, m."""
     step: Callable[[Float], Float]
     """Spacing of the depths that the sensor can report at z, m."""
@@ -41,22 +41,23 @@ def depth_noise(model: DepthModel) -> DepthNoise:
     return _MODELS[model]
 
 
-def _grazing(theta: Float) -> Float:
+def _grazing(theta: Float | float) -> Float:
     """theta^2 / (pi/2 - theta)^2, bounded short of the pole at grazing incidence."""
-    theta = np.minimum(theta, np.deg2rad(88.0))
-    return (theta / (np.pi / 2 - theta)) ** 2
+    bounded = np.minimum(theta, np.deg2rad(88.0))
+    return (bounded / (np.pi / 2 - bounded)) ** 2
 
 
-def _kinect_v1(z: Float, theta: Float) -> Float:
-    beyond = np.where(theta > np.deg2rad(60.0), 0.0001 / np.sqrt(z) * _grazing(theta), 0.0)
-    return 0.0012 + 0.0019 * (z - 0.4) ** 2 + beyond
+def _kinect_v1(z: Float, theta: Float | float) -> Float:
+    beyond = np.where(np.greater(theta, np.deg2rad(60.0)), 0.0001 * _grazing(theta), 0.0)
+    frontal = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    return frontal + beyond / np.sqrt(z) if np.any(beyond) else frontal
 
 
-def _kinect_v2(z: Float, theta: Float) -> Float:
+def _kinect_v2(z: Float, theta: Float | float) -> Float:
     return 0.001 * (1.5 - 0.5 * z + 0.3 * z**2 + 0.1 * z**1.5 * _grazing(theta))
 
 
-def _realsense(z: Float, theta: Float) -> Float:
+def _realsense(z: Float, theta: Float | float) -> Float:
     return np.maximum(_REALSENSE_Z2 * z**2, _MESSAGE_STEP_M) + 0.0 * theta
 
 

@@ -12,12 +12,12 @@ from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
-from .pattern_fit import PatternFit, fit_patterns
+from .pattern_fit import PatternFit, Window, fit_patterns, surroundings
 from .search import Candidate, MarkerSearch
 
 Float = NDArray[np.float64]
 
-CORNER_FLOOR_PX = 0.01
+CORNER_FLOOR_PX = 0.004
 """What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
 _MIN_CORRELATION = 0.80
 """Pixels with the fitted pattern, for a marker that was read."""
@@ -25,6 +25,9 @@ _MIN_CORRELATION_PREDICTED = 0.90
 """The same for one that was only expected there."""
 _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
+_MIN_SHARE = 0.5
+"""Of the pattern's edges, what has to be seen as the model says."""
+_SETTLED_PX = 0.3
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
 
@@ -124,9 +127,19 @@ class MarkerFrontEnd:
             group, starts = [c for c, k in zip(group, keep, strict=True) if k], starts[keep]
             if group:
                 patterns = [self._patterns[c.key] for c in group]
-                fit = fit_patterns(grey, starts, patterns, self._positions)
+                fit = fit_patterns(grey, starts, patterns, self._positions, self._windows(starts, cells, grey.shape))
                 result += [_judged(c, starts[k], fit, k, cells, min_correlation) for k, c in enumerate(group)]
         return result
+
+    def _windows(self, ideal: Float, cells: int, shape: tuple[int, ...]) -> list[Window] | None:
+        """Where to find the pixels of markers in an image that the lens has bent."""
+        if self._positions is None:
+            return None
+        middles = (ideal + np.roll(ideal, 1, axis=1)) / 2
+        outline = distort(self._camera, np.concatenate([ideal, middles], axis=1))
+        boxes = np.stack([np.nanmin(outline, axis=1), np.nanmax(outline, axis=1)], 1)[:, [0, 0, 1, 1]]
+        boxes[:, 1, 1], boxes[:, 3, 1] = boxes[:, 2, 1], boxes[:, 0, 1]
+        return [surroundings(box, cells, (shape[1], shape[0])) for box in boxes]
 
     def _ours(self, candidate: Candidate, ideal: bool) -> Float:
         if ideal:
@@ -205,6 +218,10 @@ def _judged(candidate: Candidate, start: Float, fit: PatternFit, k: int, cells: 
         problem = ("contrast in grey values", float(fit.contrast[k]), _MIN_CONTRAST)
     elif fit.correlation[k] < min_correlation:
         problem = ("correlation with the pattern", float(fit.correlation[k]), min_correlation)
+    elif fit.share[k] < _MIN_SHARE:
+        problem = ("share of the edges that fit", float(fit.share[k]), _MIN_SHARE)
+    elif fit.last_step_px[k] > _SETTLED_PX:
+        problem = ("the fit did not settle, last step in px", float(fit.last_step_px[k]), _SETTLED_PX)
     elif moved > 1.5:
         problem = ("the fit left the marker, move in cells", moved, 1.5)
     return _Fitted(candidate, corners, covariance, float(fit.correlation[k]), float(fit.contrast[k]), problem)

@@ -13,6 +13,7 @@ with D the second difference of the pattern (cells outside are white), Phi the n
 edge line k at the blur's width there, and a first-order term for grid lines that are not at right angles in the image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,24 +21,34 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
+Window = tuple[int, int, int, int]
+Windows = Sequence[Window]
 
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 _MAX_PIXELS = 512
 """Pixels per marker; more cost time and give nothing that the model's own error does not swamp."""
-_FEW_PIXELS = 160
+_FEW_PIXELS = 200
 """Of them, those that the first steps use."""
-_LATTICE = 3000
+_COARSE_LATTICE, _LATTICE = 800, 3000
 """Pixels of a marker that are looked at to choose from."""
-_REACH_PX = 3.0
-"""Pixels farther than this from every grid line say nothing about the corners."""
+_COARSE_REACH_PX = 3.0
+_REACH_PX, _REACH_BLURS = 0.7, 2.2
+"""Pixels farther than this from every edge of the pattern say little about the corners."""
 _MARGIN_CELLS = 0.9
 """How far outside the border the page is taken to be white."""
 _BLUR_RANGE_PX = (0.25, 4.0)
+_COARSE_BLUR_PX = 0.8
+"""Least blur of the first stage: with a sharper model too few of its pixels would feel the edges."""
+_STEP_PX = 1.0
+_CAUTIOUS_AFTER, _CAUTION = 3, 0.6
+"""From that step on only a part of each is taken, which ends the swinging to and fro that outlying pixels can cause."""
+_BLOCK_PX, _BLOCK_PIXELS = 3, 8
+"""Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 _BLUR_STEP_PX2 = 2.0
-_COARSE_PX, _FINE_PX = 0.15, 0.03
+_COARSE_PX, _FINE_PX = 0.15, 0.012
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
-_FORGIVEN_PX = 0.15
-"""Edges may be that far off, beside the noise, before their pixels lose weight."""
+_COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
+"""Edges may be that far off, beside the noise, before their pixels lose weight, in either stage."""
 _ROUNDING = np.sqrt(1.0 / 12.0)
 """Standard deviation of the rounding to whole grey values."""
 _INV_SQRT_2PI = np.float32(1.0 / np.sqrt(2.0 * np.pi))
@@ -61,6 +72,10 @@ class PatternFit:
     """Shape (m,), rms of the residuals in grey values, robust."""
     correlation: Float
     """Shape (m,), of the pixels with the model."""
+    share: Float
+    """Shape (m,), of the weight of the edges, what the robust fit has kept; small where the pattern is covered."""
+    last_step_px: Float
+    """Shape (m,), what the last step moved a corner by (part of the covariance); large where the fit did not settle."""
     noise_factor: Float
     """Shape (m,), how much residuals that hang together raise the variance over white noise of the same size."""
 
@@ -81,11 +96,6 @@ class _Pixels:
         if len(which) == len(self.value):
             return self
         return _Pixels(self.origin[which], self.xy[which], self.value[which], self.weight[which], self.block[which])
-
-    def first(self, count: int) -> "_Pixels":
-        return _Pixels(
-            self.origin, self.xy[:, :count], self.value[:, :count], self.weight[:, :count], self.block[:, :count]
-        )
 
 
 def homography(corners: Float) -> Float:
@@ -198,18 +208,36 @@ def _steps(place: Single, lines: Single, over_width: Single) -> tuple[Single, Si
     return t, step, _INV_SQRT_2PI * np.exp(-0.5 * square)
 
 
-def _choose_pixels(
-    image: NDArray[np.uint8], positions: Float | None, corners: Float, cells: NDArray[np.int64]
-) -> _Pixels:
-    """Pixels near the grid lines of each marker, at most `_MAX_PIXELS`, spread evenly.
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """Which pixels of a marker are looked at."""
 
-    `positions` holds the ideal pixel of each image pixel, shape (height, width, 2); None where they are the same, in
-    which case corners are image pixels.
+    reach_px: Float
+    """Distance from an edge of the pattern, shape (m,)."""
+    lattice: int
+    """Pixels that are looked at to choose from."""
+    most: int
+
+
+def _choose_pixels(
+    image: NDArray[np.uint8],
+    positions: Float | None,
+    windows: Windows,
+    corners: Float,
+    patterns: list[Float],
+    choice: _Choice,
+) -> _Pixels:
+    """Pixels near the edges of each marker's pattern, spread evenly.
+
+    `positions` holds the ideal pixel of each image pixel, shape (height, width, 2); None where they are the same.
     """
-    height, width = image.shape
+    width = image.shape[1]
     origin = corners.mean(1)
     H = homography(corners)
-    chosen = [_near_lines(corners[k], H[k], int(cells[k]), width, height, positions) for k in range(len(corners))]
+    chosen = [
+        _near_edges(H[k], patterns[k], width, positions, windows[k], choice, choice.reach_px[k])
+        for k in range(len(corners))
+    ]
     n = max((len(c) for c in chosen), default=0)
     m = len(corners)
     xy, value, weight = np.zeros((m, n, 2), np.float32), np.zeros((m, n), np.float32), np.zeros((m, n), np.float32)
@@ -220,52 +248,59 @@ def _choose_pixels(
         here = np.column_stack([columns, rows]) if positions is None else positions[rows, columns]
         xy[k, :count], value[k, :count], weight[k, :count] = here - origin[k], image[rows, columns], 1.0
         if count:
-            across = (columns - columns.min()) // 3
-            block[k, :count] = (rows - rows.min()) // 3 * (across.max() + 1) + across
+            x0, y0, x1, y1 = windows[k]
+            size = max(_BLOCK_PX, int(np.sqrt((x1 - x0) * (y1 - y0) * _BLOCK_PIXELS / count)))
+            across = (columns - x0) // size
+            block[k, :count] = (rows - y0) // size * ((x1 - x0) // size + 1) + across
     return _Pixels(origin, xy, value, weight, block)
 
 
-def _near_lines(
-    corners: Float, H: Float, cells: int, width: int, height: int, positions: Float | None
+def _near_edges(
+    H: Float, pattern: Float, width: int, positions: Float | None, window: Window, choice: _Choice, reach_px: float
 ) -> NDArray[np.int64]:
-    """Flat indices of the pixels of one marker."""
-    side = max(np.linalg.norm(corners[2] - corners[0]), np.linalg.norm(corners[3] - corners[1]))
-    grow = side / cells + 2.0
-    low, high = corners.min(0) - grow, corners.max(0) + grow
-    x0, y0 = max(int(low[0]), 0), max(int(low[1]), 0)
-    x1, y1 = min(int(high[0]) + 1, width), min(int(high[1]) + 1, height)
-    if positions is not None:
-        x0, y0, x1, y1 = _raw_window(positions, low, high)
+    """Flat indices of the pixels of one marker, in no order of place."""
+    x0, y0, x1, y1 = window
     if x1 - x0 < 4 or y1 - y0 < 4:
         return np.zeros(0, np.int64)
-    # a lattice of oblique lines: on a large marker dense enough to choose from, and along no edge
-    step = max(1, (x1 - x0) * (y1 - y0) // _LATTICE)
-    index = np.arange(0, (x1 - x0) * (y1 - y0), step)
-    rows, columns = np.divmod(index, x1 - x0)
+    # every so manieth pixel: on a large marker enough to choose from; the odd step runs along no edge for long
+    step = max(1, (x1 - x0) * (y1 - y0) // choice.lattice)
+    step += (x1 - x0) % step == 0 and step > 1
+    rows, columns = np.divmod(np.arange(0, (x1 - x0) * (y1 - y0), step), x1 - x0)
     rows, columns = rows + y0, columns + x0
-    index = rows * width + columns
     xy = np.column_stack([columns, rows]).astype(float) if positions is None else positions[rows, columns]
     inverse = np.linalg.inv(H)
     r = xy @ inverse[:, :2].T + inverse[:, 2]
-    ab = r[:, :2] / r[:, 2:] * cells
-    margin = _MARGIN_CELLS
-    off = np.abs(ab - cells / 2)
-    inside = (r[:, 2] > 0) & (np.maximum(off[:, 0], off[:, 1]) < cells / 2 + margin)
-    cell_px = side / (np.sqrt(2.0) * cells)
-    off_line = np.abs(ab - np.rint(ab))
-    to_line = np.minimum(off_line[:, 0], off_line[:, 1]) * cell_px
-    index = index[inside & (to_line < _REACH_PX)]
+    cells = len(pattern)
+    a, b = r[:, 0] / r[:, 2] * cells, r[:, 1] / r[:, 2] * cells
+    off = np.maximum(np.abs(a - cells / 2), np.abs(b - cells / 2))
+    inside = (r[:, 2] > 0) & (off < cells / 2 + _MARGIN_CELLS)
+    a, b = a[inside], b[inside]
+    corners = (H @ np.column_stack([_UNIT, np.ones(4)]).T).T
+    corners = corners[:, :2] / corners[:, 2:]
+    u = np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3]) / 2
+    v = np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1]) / 2
+    near = _edge_within(a, b, pattern, reach_px * cells / u) | _edge_within(b, a, pattern.T, reach_px * cells / v)
+    index = (rows * width + columns)[inside][near]
     scatter = (index * 2654435761) % 4294967296
-    return index[np.argsort(scatter)[:_MAX_PIXELS]]
+    return index[np.argsort(scatter)[: choice.most]]
 
 
-def _raw_window(positions: Float, low: Float, high: Float) -> tuple[int, int, int, int]:
-    with np.errstate(invalid="ignore"):
-        inside = ((positions > low) & (positions < high)).all(-1)
-    rows, columns = np.flatnonzero(inside.any(1)), np.flatnonzero(inside.any(0))
-    if not len(rows):
-        return 0, 0, 0, 0
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+def _edge_within(across: Float, along: Float, pattern: Float, reach_cells: float) -> NDArray[np.bool_]:
+    """Whether the grid line nearest in `across` is an edge of the pattern there, and within reach."""
+    extended = np.pad(pattern, 1, constant_values=1.0)
+    edges = np.abs(np.diff(extended, axis=0)) > 0.5
+    line = np.clip(np.rint(across), 0, len(pattern)).astype(int)
+    cell = np.clip(np.floor(along), -1, len(pattern)).astype(int) + 1
+    return edges[line, cell] & (np.abs(across - line) < reach_cells)
+
+
+def surroundings(corners: Float, cells: int, size: tuple[int, int]) -> Window:
+    """x0, y0, x1, y1 (exclusive) round a marker and a little more than a cell, within an image (width, height)."""
+    diagonal = max(np.linalg.norm(corners[2] - corners[0]), np.linalg.norm(corners[3] - corners[1]))
+    grow = diagonal / cells + 2.0
+    low, high = np.nan_to_num(corners.min(0) - grow), np.nan_to_num(corners.max(0) + grow)
+    x0, y0 = max(int(low[0]), 0), max(int(low[1]), 0)
+    return x0, y0, min(int(high[0]) + 2, size[0]), min(int(high[1]) + 2, size[1])
 
 
 def fit_patterns(
@@ -273,6 +308,7 @@ def fit_patterns(
     corners: Float,
     patterns: list[Float],
     positions: Float | None = None,
+    windows: Windows | None = None,
     steps: int = 6,
     blur_px: float = 1.2,
 ) -> PatternFit:
@@ -284,19 +320,26 @@ def fit_patterns(
         patterns: m arrays (cells, cells), see `MarkerDictionary.pattern`.
         positions: the ideal pixel of each image pixel, shape (height, width, 2), NaN beyond the lens model; None where
             the lens does not distort.
-        steps: Gauss-Newton steps.
+        windows: x0, y0, x1, y1 of each marker with its surroundings in the raw image, needed with `positions`.
+        steps: most Gauss-Newton steps of each of the two stages.
         blur_px: blur to start from.
     """
     cells = np.array([len(p) for p in patterns])
     D = np.stack([_second_difference(p) for p in patterns]).astype(np.float32)
     lines = (np.arange(-1, cells[0] + 2) / cells[0]).astype(np.float32)
-    pixels = _choose_pixels(image, positions, corners, cells)
-    few = pixels.first(_FEW_PIXELS)
-    centred = corners - pixels.origin[:, None]
-    blur = np.tile([blur_px**2, blur_px**2, 0.0], (len(corners), 1))
-    cell_px = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=1) / (np.sqrt(2.0) * cells)
-    state, _ = _descend(_State(centred, blur, None), few, D, lines, cell_px, steps, _COARSE_PX)
-    state, solved = _descend(state, pixels, D, lines, cell_px, steps, _FINE_PX)
+    size = image.shape[1], image.shape[0]
+    around = [surroundings(c, len(p), size) for c, p in zip(corners, patterns, strict=True)]
+    windows = around if windows is None else windows
+    m = len(corners)
+    few = _Choice(np.full(m, _COARSE_REACH_PX), _COARSE_LATTICE, _FEW_PIXELS)
+    pixels = _choose_pixels(image, positions, windows, corners, patterns, few)
+    blur = np.tile([blur_px**2, blur_px**2, 0.0], (m, 1))
+    state, _ = _descend(_State(corners - pixels.origin[:, None], blur, None), pixels, D, lines, steps, True)
+    coarse = state.corners + pixels.origin[:, None]
+    reach = _REACH_PX + _REACH_BLURS * np.sqrt(state.blur[:, :2].max(1))
+    pixels = _choose_pixels(image, positions, windows, coarse, patterns, _Choice(reach, _LATTICE, _MAX_PIXELS))
+    state = _State(coarse - pixels.origin[:, None], state.blur, state.light)
+    state, solved = _descend(state, pixels, D, lines, steps, False)
     return _summary(state, solved, pixels)
 
 
@@ -321,9 +364,9 @@ class _Solved:
 
 
 def _descend(
-    state: _State, pixels: _Pixels, D: Single, lines: Single, cell_px: Float, steps: int, enough_px: float
+    state: _State, pixels: _Pixels, D: Single, lines: Single, steps: int, coarse: bool
 ) -> tuple[_State, _Solved]:
-    """Gauss-Newton on each marker until none of its corners moves by more than `enough_px`."""
+    """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for."""
     m, n = pixels.value.shape
     corners, blur = state.corners.copy(), state.blur.copy()
     light = np.zeros((m, 10)) if state.light is None else state.light.copy()
@@ -334,24 +377,25 @@ def _descend(
         np.zeros((m, n), np.float32),
         np.zeros((m, n, 8), np.float32),
     )
+    forgiven = _COARSE_FORGIVEN_PX if coarse else _FORGIVEN_PX
     active = np.arange(m)
     for count in range(steps):
         lit = None if count == 0 and state.light is None else light[active]
-        one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines)
+        one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines, forgiven)
         largest = np.abs(one.step[:, :8]).max(1)
-        shrink = np.minimum(1.0, cell_px[active] / np.maximum(largest, 1e-9))
+        shrink = np.minimum(1.0 if count < _CAUTIOUS_AFTER else _CAUTION, _STEP_PX / np.maximum(largest, 1e-9))
         corners[active] += (one.step[:, :8] * shrink[:, None]).reshape(-1, 4, 2)
-        blur[active] = _bounded(blur[active], one.step[:, 8:11])
+        blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
         light[active] = one.step[:, 11:]
         for name in ("step", "inverse", "residual", "weight", "jacobian"):
             getattr(solved, name)[active] = getattr(one, name)
-        active = active[largest > enough_px]
+        active = active[largest > (_COARSE_PX if coarse else _FINE_PX)]
         if not len(active):
             break
     return _State(corners, blur, light), solved
 
 
-def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single) -> _Solved:
+def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single, forgiven_px: float) -> _Solved:
     """One Gauss-Newton step of corners and blur, with new light, outlying pixels softened.
 
     The very first step (no light yet) finds the light beforehand and softens nothing: everything is off then.
@@ -372,7 +416,7 @@ def _solve(state: _State, pixels: _Pixels, D: Single, lines: Single) -> _Solved:
     columns[..., 8:11] = gain[..., None] * model.by_blur
     if state.light is not None:
         slope = gain * np.sqrt(np.einsum("mni,mni->mn", model.gradient, model.gradient))
-        weight = weight * _softened(residual, _robust_scale(residual, weight), slope)
+        weight = weight * _softened(residual, _robust_scale(residual, weight), forgiven_px * slope)
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
     step[:, 11:] += light
@@ -390,12 +434,12 @@ def _by_corners(H: Float, model: _Model, xy: Single, gain: Single) -> Single:
     return by_H @ _corner_basis(H).astype(np.float32)
 
 
-def _bounded(blur: Float, step: Float) -> Float:
+def _bounded(blur: Float, step: Float, least_px: float) -> Float:
     """The blur after a step, its widths kept within what lenses and hands do."""
     new = blur + np.clip(step, -_BLUR_STEP_PX2, _BLUR_STEP_PX2)
     matrix = new[:, [[0, 2], [2, 1]]]
     values, vectors = np.linalg.eigh(matrix)
-    values = np.clip(values, _BLUR_RANGE_PX[0] ** 2, _BLUR_RANGE_PX[1] ** 2)
+    values = np.clip(values, least_px**2, _BLUR_RANGE_PX[1] ** 2)
     matrix = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
     return np.stack([matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 0, 1]], -1)
 
@@ -424,9 +468,9 @@ def _robust_scale(residual: Single, weight: Single) -> Float:
     return 1.4826 * np.where(count > 0, median, 0.0) + _ROUNDING
 
 
-def _softened(residual: Single, scale: Float, slope: Single) -> Single:
+def _softened(residual: Single, scale: Float, forgiven: Single) -> Single:
     """Tukey-like weights: whole up to 2.5 sigma, nothing beyond 6, an edge that is a little off forgiven."""
-    allowed = (_FORGIVEN_PX * slope) ** 2 + (scale.astype(np.float32) ** 2)[:, None]
+    allowed = forgiven**2 + (scale.astype(np.float32) ** 2)[:, None]
     return np.clip((6.0 - np.abs(residual) / np.sqrt(allowed)) / 3.5, 0.0, 1.0)
 
 
@@ -441,9 +485,11 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
 def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
     weight, light = solved.weight, solved.step[:, 11:]
     freedom = np.maximum(weight.sum(1) - 21.0, 1.0)
-    variance = (solved.residual**2 * weight).sum(1) / freedom + _ROUNDING**2
+    variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
     factor = _hang_together(solved, pixels, weight)
+    last_step = np.abs(solved.step[:, :8]).max(1)
     covariance = solved.inverse[:, :8, :8] * (variance * factor)[:, None, None]
+    covariance += (last_step**2)[:, None, None] * np.eye(8)
     return PatternFit(
         state.corners + pixels.origin[:, None],
         covariance,
@@ -451,19 +497,32 @@ def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
         light[:, 1],
         np.sqrt(variance),
         _correlation(pixels.value, solved.residual, weight),
+        _share(solved, pixels),
+        last_step,
         factor,
     )
 
 
+def _share(solved: _Solved, pixels: _Pixels) -> Float:
+    strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian)
+    whole = (strength * pixels.weight).sum(1)
+    return ((strength * solved.weight).sum(1) / np.maximum(whole, 1e-9)).astype(float)
+
+
 def _hang_together(solved: _Solved, pixels: _Pixels, weight: Single) -> Float:
-    """Variance of the sums of residuals over small blocks against that of independent ones, at least 1, shape (m,)."""
+    """Variance of the sums of residuals over small blocks against that of independent ones, shape (m,).
+
+    1 where it is no larger than chance makes it.
+    """
     m = len(weight)
     blocks = int(pixels.block.max(initial=0)) + 1
     place = (pixels.block + blocks * np.arange(m)[:, None]).ravel()
     score = ((solved.residual * weight)[..., None] * solved.jacobian).astype(float)
     apart = (score**2).sum((1, 2))
-    together = np.zeros(m)
+    together, used = np.zeros(m), np.zeros(m)
     for k in range(8):
-        sums = np.bincount(place, score[..., k].ravel(), minlength=m * blocks)
-        together += (sums**2).reshape(m, blocks).sum(1)
-    return np.maximum(1.0, together / np.maximum(apart, 1e-12))
+        sums = np.bincount(place, score[..., k].ravel(), minlength=m * blocks).reshape(m, blocks) ** 2
+        together += sums.sum(1)
+        used = np.maximum(used, sums.sum(1) ** 2 / np.maximum((sums**2).sum(1), 1e-12))
+    factor = together / np.maximum(apart, 1e-12)
+    return np.where(factor > 1.0 + 2.0 * np.sqrt(2.0 / np.maximum(used, 1.0)), factor, 1.0)

@@ -14,14 +14,17 @@ from scipy.special import ndtr
 Float = NDArray[np.float64]
 
 _STRETCH_PX = 8.0
-_ITERATIONS = 15
+_ITERATIONS = 16
 _LOG_BLUR_RANGE = (float(np.log(0.4)), float(np.log(1.2)))
 """A pixel alone blurs by 0.3 px. Edges softer than 1.2 px are shading or out of focus."""
-_FARTHEST_PX = 1.5
-"""The fit may move the line so far; the seed is better than that."""
+_USUAL_LOG_BLUR = float(np.log(0.6))
+_FARTHEST_PX = 2.6
+"""The fit may move the line so far: shading inside can be steeper than the edge that a seed is taken for."""
 _KINKS_PX = (0.0, 1.8, 3.2)
 """Depths at which the shading may change its slope."""
-_SHADING_RANGE = 100.0
+_WIDE, _NARROW = (4.5, 5.0), (3.0, 2.5)
+"""How far outside and inside the edge a fit looks, px."""
+_SHADING_RANGE = 80.0
 """Prior sigma of a shading term, grey values over half the pipe's width."""
 
 
@@ -48,13 +51,22 @@ class EdgeFit:
     stretches: int
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _State:
     offset: float
     turn: float
     log_blur: float
     shading: Float
     """Coefficients of `_shading`, grey values at full depth."""
+
+    def moved(self, step: Float) -> "_State":
+        log_blur = float(np.clip(self.log_blur + np.clip(step[2], -0.3, 0.3), *_LOG_BLUR_RANGE))
+        offset = self.offset + float(np.clip(step[0], -0.7, 0.7))
+        return _State(offset, self.turn + float(np.clip(step[1], -0.03, 0.03)), log_blur, self.shading + step[3:])
+
+    def deviation(self) -> Float:
+        """From the priors' means."""
+        return np.concatenate(((0.0, 0.0, self.log_blur - _USUAL_LOG_BLUR), self.shading))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +94,8 @@ class _Linear:
     shift: Float
     """(stretches,), where each alone would put the edge, px from the line."""
     shift_sigma: Float
+    squares: Float
+    """(stretches,), sum of squared residuals."""
     variance: Float
 
 
@@ -114,42 +128,67 @@ def fit_edge(
     Returns:
         None where the grey values do not hold such an edge.
     """
-    pixels = _gather(grey, px, line, foot_px, span, half_width_px, noise)
-    if pixels is None:
-        return None
-    start = np.zeros(1 + len(_KINKS_PX))
-    state, weights = _State(0.0, 0.0, float(np.log(0.6)), start), np.ones(len(pixels.grey))
+    fits = []
+    for window in (_WIDE, _NARROW):
+        pixels = _gather(grey, px, line, foot_px, span, half_width_px, noise, window)
+        state = None if pixels is None else _converged(pixels)
+        if pixels is None or state is None:
+            return None
+        fits.append((pixels, state))
+    (pixels, state), (_, other) = fits
+    # What the two windows do not agree on is the model's error, not noise.
+    spread = np.diag([(state.offset - other.offset) ** 2, (state.turn - other.turn) ** 2])
+    return _result(line, foot_px, pixels, state, spread)
+
+
+def _converged(pixels: _Pixels) -> _State | None:
+    """Levenberg-Marquardt in three stages (see `_prior`); None where the edge runs away."""
+    state = _State(0.0, 0.0, _USUAL_LOG_BLUR, np.zeros(1 + len(_KINKS_PX)))
+    linear, weights, damping = _linearise(pixels, state), np.ones(len(pixels.grey)), 1e-3
     for iteration in range(_ITERATIONS):
-        linear = _linearise(pixels, state)
-        weights = _weights(linear) if iteration >= 2 else np.ones(len(pixels.grey))
+        prior = _prior(iteration // 4)
+        normal, scores = _normal(linear, weights, prior)
+        gradient = scores.sum(axis=0) - prior * state.deviation()
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        trial = state.moved(step)
+        if abs(trial.offset) > _FARTHEST_PX or abs(trial.turn) > 0.12:
+            return None
+        proposal = _linearise(pixels, trial)
+        scale = weights / linear.variance
+        gain = float(scale @ (linear.squares - proposal.squares))
+        gain += float(prior @ (state.deviation() ** 2 - trial.deviation() ** 2))
+        if gain < 0:
+            damping *= 10.0
+            continue
+        state, linear, damping = trial, proposal, max(damping / 5.0, 1e-4)
+        weights = _weights(linear)
         if weights.sum() < 1.5:
             return None
-        normal, scores = _normal(linear, weights, _prior(iteration // 3))
-        step = np.linalg.solve(normal, scores.sum(axis=0))
-        state.offset += float(np.clip(step[0], -0.7, 0.7))
-        state.turn += float(np.clip(step[1], -0.03, 0.03))
-        state.log_blur = float(np.clip(state.log_blur + np.clip(step[2], -0.3, 0.3), *_LOG_BLUR_RANGE))
-        state.shading = state.shading + step[3:]
-        if abs(state.offset) > _FARTHEST_PX or abs(state.turn) > 0.12:
-            return None
-        if iteration > 6 and abs(step[0]) < 2e-3 and abs(step[1]) < 1e-4:
+        if iteration > 8 and abs(step[0]) < 5e-3 and abs(step[1]) < 2e-4:
             break
-    linear = _linearise(pixels, state)
-    return _result(line, foot_px, pixels, state, linear, _weights(linear))
+    return state
 
 
 def _gather(
-    grey: Float, px: Float, line: Float, foot_px: Float, span: tuple[float, float], half_width_px: float, noise: float
+    grey: Float,
+    px: Float,
+    line: Float,
+    foot_px: Float,
+    span: tuple[float, float],
+    half_width_px: float,
+    noise: float,
+    window: tuple[float, float],
 ) -> _Pixels | None:
-    inside = float(np.clip(0.8 * half_width_px, 2.0, 5.0)) + 0.5
+    outside, deepest = window
+    inside = float(np.clip(0.8 * half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
     along = (px - foot_px) @ np.array([-line[1], line[0]])
-    keep = (depth > -4.5) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
+    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
     grey, depth, along = grey[keep], depth[keep], along[keep]
     number = max(1, round((span[1] - span[0]) / _STRETCH_PX))
     stretch = np.minimum(((along - span[0]) / (span[1] - span[0]) * number).astype(int), number - 1)
     count = np.bincount(stretch, minlength=number)
-    full = count >= 0.6 * _STRETCH_PX * (inside + 4.5)
+    full = count >= 0.6 * _STRETCH_PX * (inside + outside)
     if full.sum() < 2:
         return None
     order = np.argsort(stretch, kind="stable")
@@ -182,10 +221,11 @@ def _linearise(pixels: _Pixels, state: _State) -> _Linear:
     jacobian = jacobian * pixels.weight[..., None]
     jacobian = jacobian - basis @ (solver @ jacobian)
     freedom = np.maximum(pixels.weight.sum(axis=1) - 4, 1)
-    variance = np.maximum((residual**2).sum(axis=1) / freedom, pixels.noise**2)
+    squares = (residual**2).sum(axis=1)
+    variance = np.maximum(squares / freedom, pixels.noise**2)
     strength = np.maximum((jacobian[..., 0] ** 2).sum(axis=1), 1e-9)
     shift = (jacobian[..., 0] * residual).sum(axis=1) / strength
-    return _Linear(jacobian, residual, shift, np.sqrt(variance / strength), variance)
+    return _Linear(jacobian, residual, shift, np.sqrt(variance / strength), squares, variance)
 
 
 def _shading(tau: Float, blur: float, half_width: float) -> tuple[Float, Float, Float]:
@@ -253,9 +293,9 @@ def _larger(a: Float, b: Float) -> Float:
     return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
 
 
-def _result(
-    line: Float, foot_px: Float, pixels: _Pixels, state: _State, linear: _Linear, weights: Float
-) -> EdgeFit | None:
+def _result(line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float) -> EdgeFit | None:
+    linear = _linearise(pixels, state)
+    weights = _weights(linear)
     good = (linear.shift_sigma < 0.5) & (weights > 0.1)
     if good.sum() < 2:
         return None
@@ -269,7 +309,7 @@ def _result(
     return EdgeFit(
         line=np.array([normal[0], normal[1], -normal @ foot]),
         foot_px=foot,
-        covariance=_covariance(linear, weights),
+        covariance=_covariance(linear, weights) + spread,
         extent=(float(start), float(end)),
         blur_px=float(np.exp(state.log_blur)),
         contrast=contrast,
@@ -288,8 +328,9 @@ def _sharpness(pixels: _Pixels, state: _State, good: NDArray[np.bool_]) -> tuple
         near = weight * (np.abs(depth - middle) < 0.6)
         count = near.sum(axis=1)
         means.append(np.where(count > 0, (grey * near).sum(axis=1) / np.maximum(count, 1), np.nan))
-    with np.errstate(invalid="ignore"):
-        edge, beyond = (float(np.nanmedian(np.abs(means[i + 1] - means[i]))) for i in (0, 1))
-    if not np.isfinite(edge + beyond):
+    changes = [np.abs(means[i + 1] - means[i]) for i in (0, 1)]
+    changes = [c[np.isfinite(c)] for c in changes]
+    if not all(len(c) for c in changes):
         return 0.0, 0.0
+    edge, beyond = (float(np.median(c)) for c in changes)
     return edge, edge / max(edge + beyond, 1e-9)

@@ -53,6 +53,8 @@ class EdgePair:
     """Signed distance of the prior's centre from the middle, across the pipe."""
     score: float
     """Log-likelihood by geometry and support."""
+    surprise: float
+    """Chi-square of middle and width (and direction) against the prior."""
 
 
 def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limits: PairLimits) -> list[EdgePair]:
@@ -85,14 +87,13 @@ def _pair(
         return None
     if abs(turn) > width / (limits.nearest_vanishing_f * focal_px) + np.deg2rad(2.0):
         return None
-    score = _score(first, second, width, float(middle), bisector + 0.5 * np.pi, focal_px, prior)
-    if not np.isfinite(score):
-        return None
+    surprise = _surprise(float(width), float(middle), bisector + 0.5 * np.pi, focal_px, prior)
+    score = 0.5 * (first.evidence + second.evidence - surprise)
     out = np.array([_line(first.angle, first.rho, prior.centre_px), _line(first.angle + turn, rho, prior.centre_px)])
     centre = np.append(prior.centre_px + middle * np.array([np.cos(bisector), np.sin(bisector)]), 1.0)
     out *= -np.sign(out @ centre)[:, None]
     direction = float(np.mod(bisector + 0.5 * np.pi, np.pi))
-    return EdgePair(first, second, out, direction, float(width), float(middle), score)
+    return EdgePair(first, second, out, direction, float(width), float(middle), score, surprise)
 
 
 def _aligned(first: EdgeLine, second: EdgeLine) -> tuple[float, float]:
@@ -110,21 +111,13 @@ def _line(angle: float, rho: float, centre: Float) -> Float:
     return np.array([normal[0], normal[1], -normal @ centre - rho])
 
 
-def _score(
-    first: EdgeLine,
-    second: EdgeLine,
-    width: float,
-    middle: float,
-    direction: float,
-    focal_px: float,
-    prior: OutlinePrior,
-) -> float:
-    score = -0.5 * (middle / prior.middle_sigma_px) ** 2
+def _surprise(width: float, middle: float, direction: float, focal_px: float, prior: OutlinePrior) -> float:
+    chi2 = (middle / prior.middle_sigma_px) ** 2
     if prior.half_width_px is None:
-        score -= 0.5 * ((np.log(width / focal_px) - _USUAL_WIDTH[0]) / _USUAL_WIDTH[1]) ** 2
+        chi2 += ((np.log(width / focal_px) - _USUAL_WIDTH[0]) / _USUAL_WIDTH[1]) ** 2
     else:
-        score -= 0.5 * ((0.5 * width - prior.half_width_px) / prior.half_width_sigma_px) ** 2
+        chi2 += ((0.5 * width - prior.half_width_px) / prior.half_width_sigma_px) ** 2
     if prior.direction_rad is not None:
         turn = np.mod(direction - prior.direction_rad + np.pi / 2, np.pi) - np.pi / 2
-        score -= 0.5 * (turn / prior.direction_sigma_rad) ** 2
-    return score + 0.5 * (first.evidence + second.evidence)
+        chi2 += (turn / prior.direction_sigma_rad) ** 2
+    return float(chi2)

@@ -1,5 +1,6 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -32,6 +33,13 @@ class OutlineConfig:
     largest_sigma_px: float = 0.5
     """An edge whose place is less sure than this is no measurement."""
     shortest_px: float = 14.0
+    largest_surprise: float = 9.2
+    """Chi-square (2 degrees of freedom, 99 %) of middle and width against the prior."""
+    lowest_sharpness: float = 0.55
+    """See `limb.EdgeFit.sharpness`."""
+
+
+_NO_FIT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +47,8 @@ class _Found:
     """A hypothesis with its sub-pixel edges."""
 
     pair: EdgePair
-    fits: tuple[EdgeFit, EdgeFit]
+    fits: tuple[EdgeFit, EdgeFit] | None
+    """None where the sub-pixel fit failed; the hypothesis stays, as what might have been."""
     score: float
 
 
@@ -136,12 +145,20 @@ class OutlineFinder:
                     span = (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0))
                     fits[key] = fit_edge(values, px, line, foot, span, 0.5 * pair.width_px, noise)
                 both.append(fits[key])
-            if both[0] is not None and both[1] is not None:
-                found.append(_Found(pair, (both[0], both[1]), pair.score + _fit_score(both[0]) + _fit_score(both[1])))
-        return found
+            if both[0] is None or both[1] is None:
+                found.append(_Found(pair, None, pair.score - _NO_FIT))
+            else:
+                found.append(_Found(pair, (both[0], both[1]), pair.score))
+        blur = _sharp_blur(fits.values())
+        return [
+            f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
+            for f in found
+        ]
 
     @staticmethod
     def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
+        if found.fits is None:
+            return found
         lines = np.array([fit.line for fit in found.fits])
         feet = np.array([fit.foot_px for fit in found.fits])
         score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
@@ -152,6 +169,7 @@ class OutlineFinder:
     ) -> OutlineSighting | Rejection:
         if not found:
             return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
+        config = self._config
         scores = np.array([f.score for f in found])
         share = np.exp(scores - scores.max())
         quality = float(share[0] / share.sum())
@@ -159,6 +177,15 @@ class OutlineFinder:
             return self._refuse(stamp_ns, pipe_id, "outline is ambiguous, probability of the best pair of edges",
                                 quality, self._config.lowest_quality)  # fmt: skip
         best = found[0]
+        if best.fits is None:
+            return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
+        if best.pair.surprise > config.largest_surprise:
+            return self._refuse(stamp_ns, pipe_id, "edges lie where they are not expected, chi-square of 2",
+                                best.pair.surprise, config.largest_surprise)  # fmt: skip
+        soft = min(fit.sharpness for fit in best.fits)
+        if soft < config.lowest_sharpness:
+            return self._refuse(stamp_ns, pipe_id, "edge is soft like shading, part of the change within 1 px",
+                                soft, config.lowest_sharpness)  # fmt: skip
         sigma = max(float(np.sqrt(fit.covariance[0, 0])) for fit in best.fits)
         if sigma > self._config.largest_sigma_px:
             return self._refuse(stamp_ns, pipe_id, "edge is unsure, sigma in px", sigma, self._config.largest_sigma_px)
@@ -170,6 +197,7 @@ class OutlineFinder:
     def _sighting(
         self, stamp_ns: int, pipe_id: str, best: _Found, prior: OutlinePrior, quality: float
     ) -> OutlineSighting:
+        assert best.fits is not None
         lines = np.array([fit.line for fit in best.fits])
         feet = np.array([fit.foot_px for fit in best.fits])
         along = np.column_stack((-lines[:, 1], lines[:, 0]))
@@ -188,23 +216,33 @@ class OutlineFinder:
 
 
 def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
-    """Lowers hypotheses that lie within another one about the same middle: a highlight has two edges as well."""
+    """Lowers hypotheses that lie within another likely one: highlights and the pipe's own shadow have edges as well."""
     result = []
     for inner in found:
-        nested = any(
-            outer.pair.width_px > inner.pair.width_px + 3.0
-            and abs(outer.pair.middle_px - inner.pair.middle_px) < 2.0
-            and outer.score > inner.score - 4.0
-            for outer in found
-        )
+        nested = any(outer is not inner and outer.fits is not None and _contains(outer, inner) for outer in found)
         result.append(replace(inner, score=inner.score - penalty * nested))
     return sorted(result, key=lambda f: -f.score)
 
 
-def _fit_score(fit: EdgeFit) -> float:
-    """Agreement of an edge with one sharp straight step: share of good stretches; shading and highlights are soft."""
-    soft = max(0.55 - fit.sharpness, 0.0) / 0.12
-    return 4.0 * (fit.supported / fit.stretches - 1.0) - 0.5 * soft**2
+def _contains(outer: _Found, inner: _Found) -> bool:
+    """True when both edges of `outer` lie at or outside those of `inner`, one clearly so."""
+    if outer.pair.width_px < inner.pair.width_px + 1.5 or outer.pair.surprise > 6.0:
+        return False
+    shift = abs(outer.pair.middle_px - inner.pair.middle_px)
+    return shift < 0.5 * (outer.pair.width_px - inner.pair.width_px) + 0.8
+
+
+def _fit_score(fit: EdgeFit, blur_px: float) -> float:
+    """Log-likelihood that an edge is one sharp straight step, for which shading and highlights are too soft."""
+    step = float(np.clip(12.0 * (fit.sharpness - 0.65), -5.0, 2.0))
+    soft = max(np.log(fit.blur_px / blur_px), 0.0) / 0.25
+    return 4.0 * (fit.supported / fit.stretches - 1.0) + step - 0.5 * float(soft**2)
+
+
+def _sharp_blur(fits: Iterable[EdgeFit | None]) -> float:
+    """Blur that a sharp edge has in this image, from the sharper edges about the pipe; at least the usual 0.6 px."""
+    values = [fit.blur_px for fit in fits if fit is not None and fit.sharpness > 0.75]
+    return max(0.6, float(np.quantile(values, 0.25))) if values else 0.6
 
 
 def silhouette_sighting(

@@ -19,6 +19,12 @@ Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 
+_CONVERGED_PX = 0.01
+"""A patch that still moves more than this after the last step is given up: those that creep are the bad ones."""
+_LONGEST_STEP_PX = 1.5
+_LARGEST_BEND = 0.4
+
+
 @dataclass(slots=True)
 class Patches:
     """Reference patches of n tracks with `m` samples each."""
@@ -26,9 +32,9 @@ class Patches:
     values: Float32
     """Shape (n, m), normalised."""
     steps: Float32
-    """Shape (n, 2, m): shift in the reference's pixels per normalised difference."""
-    normal: Float
-    """Shape (n, k, k)."""
+    """Shape (n, k, m), k = 2 or 6: shift in the reference's pixels per normalised difference."""
+    prior: Float
+    """Shape (n, k, k): share of the step that pulls a bent warp back to the given one."""
     inverse_hessian: Float
     """Shape (n, 2, 2): covariance of the shift for unit variance of the raw difference, px^2 per grey value^2."""
     contrast: Float
@@ -37,7 +43,7 @@ class Patches:
     def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
         """The patches at the given indices or of the given mask."""
         return Patches(
-            self.values[index], self.steps[index], self.normal[index], self.inverse_hessian[index], self.contrast[index]
+            self.values[index], self.steps[index], self.prior[index], self.inverse_hessian[index], self.contrast[index]
         )
 
     def append(self, other: "Patches") -> "Patches":
@@ -45,7 +51,7 @@ class Patches:
         return Patches(
             np.concatenate((self.values, other.values)),
             np.concatenate((self.steps, other.steps)),
-            np.concatenate((self.normal, other.normal)),
+            np.concatenate((self.prior, other.prior)),
             np.concatenate((self.inverse_hessian, other.inverse_hessian)),
             np.concatenate((self.contrast, other.contrast)),
         )
@@ -54,7 +60,7 @@ class Patches:
         """Replaces the patches of `mask` (n,) by others."""
         self.values[mask] = other.values
         self.steps[mask] = other.steps
-        self.normal[mask] = other.normal
+        self.prior[mask] = other.prior
         self.inverse_hessian[mask] = other.inverse_hessian
         self.contrast[mask] = other.contrast
 
@@ -74,16 +80,23 @@ class Alignment:
 
 
 class PatchGrid:
-    """Sample places and weights of a square patch: `radius` samples to each side, `spacing_px` apart."""
+    """Sample places and weights of a square patch.
 
-    def __init__(self, radius: int, spacing_px: float = 1.0, affine: bool = False, stiffness: float = 0.02) -> None:
-        self.affine, self.stiffness = affine, stiffness
+    Args:
+        radius: samples to each side of the middle.
+        spacing_px: between samples.
+        bend_sigma: standard deviation of the warp's linear part about the given one; 0 estimates the shift alone.
+    """
+
+    def __init__(self, radius: int, spacing_px: float = 1.0, bend_sigma: float = 0.0) -> None:
+        self.affine = bend_sigma > 0
         axis = np.arange(-radius, radius + 1, dtype=np.float64) * spacing_px
         u, v = np.meshgrid(axis, axis)
         self.offsets = np.stack((u.ravel(), v.ravel()), axis=1)
         weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
-        """Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
+        """Shape (m,). Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
+        self._stiffness = float((self.weights**2).sum()) / bend_sigma**2 if self.affine else 0.0
         self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
 
     def sample(self, image: Float32, px: Float, linear: Float | None = None) -> Float32:
@@ -93,6 +106,20 @@ class PatchGrid:
         u = start[:, 0, None] + shifts[:, 0]
         v = start[:, 1, None] + shifts[:, 1]
         return _float32(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+    def jacobian(self, gradient: Float32) -> Float32:
+        """Derivatives (n, k, m) by shift and, where it is estimated, linear part (row by row), from (n, 2, m)."""
+        if not self.affine:
+            return gradient
+        u, v = self._shifts
+        along_u, along_v = gradient[:, :1], gradient[:, 1:]
+        return np.concatenate((gradient, along_u * u, along_u * v, along_v * u, along_v * v), axis=1)
+
+    def prior(self, variance: Float) -> Float:
+        """Information (n, k, k) on the linear part, for a noise variance (n,) of normalised samples."""
+        weight = np.clip(variance * self._stiffness, 2e-3, 2.0) if self.affine else np.zeros(len(variance))
+        size = 6 if self.affine else 2
+        return weight[:, None, None] * np.diag(np.repeat((0.0, 1.0), (2, size - 2)))
 
     def normalise(self, values: Float32) -> tuple[Float32, Float32]:
         """Zero mean, unit variance under the weights; and the standard deviation (n,)."""
@@ -116,7 +143,11 @@ def no_patches(grid: PatchGrid) -> Patches:
 
 
 def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
-    """Reference patches (n) about `px` (n, 2) of a smoothed image."""
+    """Reference patches (n) about `px` (n, 2) of a smoothed image.
+
+    `variance` is that expected between a patch and its reference, in squared grey values: it weighs the linear part's
+    prior.
+    """
     if len(px) == 0:
         return no_patches(grid)
     values, deviation = grid.normalise(grid.sample(image, px))
@@ -129,27 +160,15 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0
     gradient -= (gradient @ grid.weights)[:, :, None]
     along = (gradient @ (values * grid.weights)[:, :, None])[:, :, 0]
     gradient -= along[:, :, None] * values[:, None, :]
-    jacobian = gradient
-    if grid.affine:
-        u, v = grid.offsets.T.astype(np.float32)
-        jacobian = np.concatenate(
-            (gradient, gradient[:, :1] * u, gradient[:, :1] * v, gradient[:, 1:] * u, gradient[:, 1:] * v), axis=1
-        )
-    size = jacobian.shape[1]
+    jacobian = grid.jacobian(gradient)
     weighted = jacobian * grid.weights
     hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-    stiffness = np.clip(variance / deviation.astype(np.float64) ** 2 * grid.stiffness, 0.002, 2.0)
-    hessian += stiffness[:, None, None] * np.diag(np.r_[0.0, 0.0, np.ones(size - 2)]) + 1e-9 * np.eye(size)
-    inverse = np.linalg.inv(hessian)
+    prior = grid.prior(variance / deviation.astype(np.float64) ** 2)
+    inverse = np.linalg.inv(hessian + prior + 1e-9 * np.eye(hessian.shape[1]))
     steps = inverse.astype(np.float32) @ weighted
     spread = (steps[:, :2] @ steps[:, :2].transpose(0, 2, 1)).astype(np.float64)
-    return Patches(
-        values,
-        steps,
-        inverse * stiffness[:, None, None],
-        spread / (deviation.astype(np.float64) ** 2)[:, None, None],
-        deviation.astype(float),
-    )
+    spread /= (deviation.astype(np.float64) ** 2)[:, None, None]
+    return Patches(values, steps, inverse @ prior, spread, deviation.astype(np.float64))
 
 
 def align(
@@ -177,26 +196,25 @@ def align(
     if n == 0:
         return Alignment(px, np.zeros(0), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
     size = patches.steps.shape[1]
-    step = np.full((n, size), np.inf)
-    extra = np.zeros((n, size))
+    bend = np.zeros((n, size))
     active = np.ones(n, dtype=bool)
     difference = np.zeros_like(patches.values)
     warp = np.array(linear)
     for _ in range(iterations):
-        index = np.flatnonzero(active)
+        # A slice where all are active: copies of all steps would cost more than the steps themselves.
+        index = slice(None) if active.all() else np.flatnonzero(active)
         values, _ = grid.normalise(grid.sample(image, px[index], warp[index]))
         difference[index] = values - patches.values[index]
         move = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0].astype(np.float64)
-        if size == 6:
-            move += (patches.normal[index] @ extra[index][:, :, None])[:, :, 0]
+        if grid.affine:
+            move += (patches.prior[index] @ bend[index][:, :, None])[:, :, 0]
         length = np.linalg.norm(move[:, :2], axis=1)
-        limit = np.minimum(1.0, 1.5 / np.maximum(length, 1e-9))
-        step[index] = move
-        if size == 6:
-            extra[index, 2:] = np.clip(extra[index, 2:] - (move * limit[:, None])[:, 2:], -0.4, 0.4)
-            warp[index] = linear[index] @ (np.eye(2) + extra[index, 2:].reshape(-1, 2, 2))
-        px[index] -= (warp[index] @ (move[:, :2] * limit[:, None])[:, :, None])[:, :, 0]
-        active[index] = length > 0.01
+        move *= np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-9))[:, None]
+        if grid.affine:
+            bend[index, 2:] = np.clip(bend[index, 2:] - move[:, 2:], -_LARGEST_BEND, _LARGEST_BEND)
+            warp[index] = linear[index] @ (np.eye(2) + bend[index, 2:].reshape(-1, 2, 2))
+        px[index] -= (warp[index] @ move[:, :2, None])[:, :, 0]
+        active[index] = length > _CONVERGED_PX
         if not active.any():
             break
     mean_square = (difference**2) @ grid.weights

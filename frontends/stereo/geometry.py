@@ -32,7 +32,8 @@ def exponential(tangent: Float) -> Float:
 
 def logarithm(pose: Float) -> Float:
     """The tangent (6,) whose `exponential` is the pose (4, 4)."""
-    return np.concatenate((cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]))
+    rotation = np.asarray(cv2.Rodrigues(pose[:3, :3])[0], dtype=np.float64)
+    return np.concatenate((rotation.ravel(), pose[:3, 3]))
 
 
 def rotation_angle(rotation: Float) -> float:

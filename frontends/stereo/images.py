@@ -30,7 +30,7 @@ def quantiles(image: Image) -> NDArray[np.float64]:
 
 
 def contrast_table(levels: NDArray[np.float64], largest_gain: float = 6.0) -> tuple[Image, float] | None:
-    """Look-up table (256,) and its gain, that stretches a dark or flat image; None where the image uses its range already."""
+    """Look-up table (256,) that stretches a dark or flat image, and its gain; None for an image that uses its range."""
     low, _, high = levels
     gain = min(largest_gain, 200.0 / max(high - low, 1.0))
     if gain < 1.5:

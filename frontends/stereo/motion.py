@@ -1,5 +1,6 @@
 """Robust motion between two stereo frames: P3P consensus, then refinement in both cameras with covariances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -31,7 +32,7 @@ def point_covariance(points: Float, covariance: Float, rig: StereoGeometry) -> F
     """Covariance (n, 3, 3) of triangulated points from that of their pixels (n, 4, 4), first order."""
     jacobian = rig.jacobian(points)
     information = jacobian.transpose(0, 2, 1) @ np.linalg.inv(covariance) @ jacobian
-    return np.linalg.inv(information + 1e-12 * np.eye(3))
+    return np.asarray(np.linalg.inv(information + 1e-12 * np.eye(3)), dtype=np.float64)
 
 
 def estimate_motion(
@@ -39,7 +40,7 @@ def estimate_motion(
     points_covariance: Float,
     px: Float,
     px_covariance: Float,
-    predicted: Float,
+    predicted: Sequence[Float],
     rig: StereoGeometry,
     min_inliers: int,
 ) -> Motion | None:
@@ -50,21 +51,24 @@ def estimate_motion(
         points_covariance: (n, 3, 3), m^2.
         px: (n, 4), ideal left and right pixels in this frame; the right ones may be NaN.
         px_covariance: (n, 4, 4), px^2.
-        predicted: (4, 4), `reference_T_this` as expected; competes with the consensus search.
+        predicted: poses (4, 4), `reference_T_this` as it may be; they compete with the consensus search, so that a
+            body that moves by itself has to hold more points than the rest to be followed.
         rig: nominal geometry.
         min_inliers: fewer give None.
     """
     if len(points) < max(min_inliers, 6):
         return None
     data = _Problem(points, points_covariance, px, px_covariance, rig)
-    candidates = [predicted]
+    candidates = list(predicted)
+    # The weights hardly depend on the pose: those of one serve until the end.
+    information = data.information(candidates[0] if candidates else np.eye(4))
     consensus = _consensus(points, px[:, :2], rig)
     if consensus is not None:
         candidates.append(consensus)
-    pose = min(candidates, key=data.cost)
-    pose = data.refine(pose)
-    chi2 = data.chi2(pose)
-    inliers = chi2 < data.gate * data.excess(pose)
+    start = min(candidates, key=lambda pose: data.cost(pose, information))
+    pose = min((data.refine(start, information), start), key=lambda pose: data.cost(pose, information))
+    chi2 = data.chi2(pose, data.information(pose))
+    inliers = chi2 < data.gate * data.excess(chi2)
     if inliers.sum() < min_inliers:
         return None
     return Motion(pose, inliers, chi2)
@@ -120,33 +124,40 @@ class _Problem:
         here[:, 2] = np.maximum(here[:, 2], 1e-3)
         return here
 
-    def _information(self, pose: Float, here: Float) -> Float:
-        jacobian = self._jacobian(here) @ pose[:3, :3].T
-        return np.linalg.inv(self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1))
+    def information(self, pose: Float) -> Float:
+        """Weights (n, k, k) of the residuals: inverse covariance of pixels and of points seen from `pose`."""
+        jacobian = self._jacobian(self._here(pose)) @ pose[:3, :3].T
+        covariance = self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1)
+        return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
-    def chi2(self, pose: Float) -> Float:
-        here = self._here(pose)
-        return _square(self._residuals(here), self._information(pose, here))
+    def chi2(self, pose: Float, information: Float) -> Float:
+        """Squared residuals (n,) in sigmas."""
+        return _square(self._residuals(self._here(pose)), information)
 
-    def cost(self, pose: Float) -> float:
-        return float(np.minimum(self.chi2(pose) / self.gate, 1.0).sum())
+    def cost(self, pose: Float, information: Float) -> float:
+        """Truncated squares: what outliers cost is bounded."""
+        return float(np.minimum(self.chi2(pose, information) / self.gate, 1.0).sum())
 
-    def excess(self, pose: Float) -> float:
-        """By how much the squared residuals exceed their covariance, from the median; at least one."""
-        return float(np.clip(np.median(self.chi2(pose) / self.expected), 1.0, 16.0))
+    def excess(self, chi2: Float) -> float:
+        """By how much squared residuals (n,) exceed their covariance, from the median; at least one."""
+        return float(np.clip(np.median(chi2 / self.expected), 1.0, 16.0))
 
-    def refine(self, pose: Float, steps: int = 10) -> Float:
-        """Gauss-Newton with Cauchy weights; the pose is moved from the right."""
-        information = self._information(pose, self._here(pose))
+    def refine(self, pose: Float, information: Float, steps: int = 10) -> Float:
+        """Gauss-Newton with the weights of Geman and McClure; the pose is moved from the right.
+
+        They fall off faster than the pull of near points grows, so that an arm close to the lens is let go.
+        """
+        scale = self.gate * self.excess(self.chi2(pose, information))
         for _ in range(steps):
             here = self._here(pose)
             residual = self._residuals(here)
-            weight = 1.0 / (1.0 + _square(residual, information) / self.gate)
+            weight = 1.0 / (1.0 + _square(residual, information) / scale) ** 2
             by_point = self._jacobian(here)
             by_pose = np.concatenate((by_point @ _cross(here), -by_point), axis=2)
             weighted = (weight[:, None, None] * information) @ by_pose
             normal = weighted.reshape(-1, 6).T @ by_pose.reshape(-1, 6) + 1e-6 * np.eye(6)
-            step = np.linalg.solve(normal, weighted.reshape(-1, 6).T @ residual.ravel())
+            moment = weighted.reshape(-1, 6).T @ residual.ravel()
+            step = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
             pose = pose @ exponential(step)
             if np.linalg.norm(step[:3]) < 1e-6 and np.linalg.norm(step[3:]) < 1e-6:
                 break

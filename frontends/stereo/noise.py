@@ -10,8 +10,9 @@ from .motion import MEDIAN_2, MEDIAN_4
 Bool = NDArray[np.bool_]
 
 _FLOOR_PX = 0.06
-"""What remains on sharp noise-free views: sampling and the patch's slant; scaled by the log's residuals like the rest."""
-_RATE = 0.3
+"""What remains on sharp noise-free views: sampling and slant; scaled by the log's residuals like the rest."""
+_REFERENCE = 1.5
+_RATE = 0.4
 """Weight of the newest keyframe in running averages."""
 
 
@@ -41,15 +42,27 @@ class NoiseModel:
         """Covariances (n, 2, 2) of aligned positions from the alignment's own ones."""
         return self._gain * (structural + _FLOOR_PX**2 * np.eye(2))
 
-    def learn_motion(self, chi2: Float, stereo: Bool) -> None:
-        """Follows the squared residuals (n,) in sigmas of a keyframe's motion; `stereo`: of 4 components, else 2."""
-        ratio = _median_ratio(chi2, stereo)
-        self._gain = float(np.clip(self._gain * ratio**_RATE, 0.2, 400.0))
+    def reference(self, structural: Float) -> Float:
+        """Covariances (n, 2, 2) of the places where references were taken.
+
+        Later views share more with each other than with the first one, from which all their patches come; measured
+        on rendered walks its residual has 1.5 times the variance of theirs.
+        """
+        return _REFERENCE * self.aligned(structural)
+
+    def learn_motion(self, chi2: Float, stereo: Bool) -> float:
+        """Follows the squared residuals (n,) in sigmas of a keyframe's motion; `stereo`: of 4 components, else 2.
+
+        Returns by how much the gain grew: the keyframe that taught it deserves it too.
+        """
+        before = self._gain
+        self._gain = float(np.clip(before * _median_ratio(chi2, stereo) ** _RATE, 0.2, 400.0))
+        return self._gain / before
 
     def learn_flow(self, chi2: Float) -> None:
         """Follows the squared residuals (n,) in sigmas of plain flow."""
         ratio = _median_ratio(chi2, np.zeros(len(chi2), dtype=bool))
-        self._flow_gain = float(np.clip(self._flow_gain * ratio**_RATE, 0.05, 400.0))
+        self._flow_gain = float(np.clip(self._flow_gain * ratio**_RATE, 0.25, 400.0))
 
     def learn_mismatch(self, alignment: Alignment, patches: Patches, seen: Bool) -> None:
         """Follows how much tracked patches differ from their reference, in squared grey values."""

@@ -35,7 +35,7 @@ class Observer:
 
     def __init__(self, rig: StereoGeometry, noise: NoiseModel, settings: StereoSettings) -> None:
         self._rig, self._noise, self._settings = rig, noise, settings
-        self.grid = PatchGrid(settings.patch_radius_px, affine=settings.affine, stiffness=settings.stiffness)
+        self.grid = PatchGrid(settings.patch_radius_px, bend_sigma=settings.bend_sigma)
 
     def view(self, pair: StereoPair) -> Keyview:
         """The pair with its smoothed images."""
@@ -111,9 +111,9 @@ class Observer:
     def _first_sighting(self, ideal: Float, raw_px: Float, right: Alignment, patches: Patches) -> Sighting:
         right_px, right_covariance = self._right(right)
         own = patches.inverse_hessian * self._noise.reference_variance(right, patches)[:, None, None]
-        left_covariance = undistort(self._rig.left, raw_px, self._noise.aligned(own))[1]
+        left_covariance = undistort(self._rig.left, raw_px, self._noise.reference(own))[1]
         assert left_covariance is not None
-        return Sighting(ideal, left_covariance, right_px, np.maximum(right_covariance, 0.0))
+        return Sighting(ideal, left_covariance, right_px, right_covariance)
 
 
 def expected_depth(tracks: Tracks, keyframe_T_this: Float) -> Float:

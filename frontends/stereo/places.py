@@ -135,7 +135,7 @@ class PlaceStore:
         covariance = lateral[:, None, None] * np.eye(3)
         both = np.hstack((px, np.full((n, 2), np.nan)))
         pixels = np.broadcast_to(1.5**2 * np.eye(4), (n, 4, 4))
-        motion = estimate_motion(points, covariance, both, pixels, np.eye(4), self._rig, min_inliers)
+        motion = estimate_motion(points, covariance, both, pixels, [np.eye(4)], self._rig, min_inliers)
         if motion is None or motion.inliers.mean() < 0.25:
             return None
         return Relocalisation(
@@ -148,7 +148,8 @@ class PlaceStore:
 
 
 def _thumbnail(image: Image) -> Float32:
-    small = np.asarray(cv2.resize(cv2.GaussianBlur(image, (0, 0), image.shape[1] / 80.0), _THUMBNAIL), np.float32)
+    small = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+    small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float32)
     small = small - small.mean()
     return small / max(float(np.linalg.norm(small)), 1e-6)
 

@@ -70,9 +70,9 @@ def revisit(
     store.missed(np.delete(rows, chosen))
     corrected = transform(inverse(motion.reference_T_this), here[chosen])
     tracks = store.revive(rows[chosen], raw_px[chosen], left_px[chosen], patches.take(chosen), corrected)
-    return _observe(
-        view, store, rows[chosen], tracks, chain_T_this @ motion.reference_T_this, observer, rig, vertical
-    ) + (motion.reference_T_this,)
+    pose = chain_T_this @ motion.reference_T_this
+    tracks, sighting = _observe(view, store, rows[chosen], tracks, pose, observer, rig, vertical)
+    return tracks, sighting, motion.reference_T_this
 
 
 def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | None:
@@ -81,7 +81,7 @@ def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | Non
     lateral = (_DRIFT_PX * here[:, 2] / rig.left.fx) ** 2
     px = np.hstack((left_px, np.full((n, 2), np.nan)))
     pixels = np.broadcast_to(np.eye(4), (n, 4, 4))
-    motion = estimate_motion(here, lateral[:, None, None] * np.eye(3), px, pixels, np.eye(4), rig, _LEAST)
+    motion = estimate_motion(here, lateral[:, None, None] * np.eye(3), px, pixels, [np.eye(4)], rig, _LEAST)
     return motion if motion is not None and motion.inliers.mean() > 0.5 else None
 
 

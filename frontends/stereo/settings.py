@@ -16,8 +16,8 @@ class StereoSettings:
     forward_backward_px: float = 0.7
     patch_radius_px: int = 7
     """Half size of the square patch that alignment compares."""
-    affine: bool = True
-    stiffness: float = 2.5
+    bend_sigma: float = 0.06
+    """Standard deviation of a patch's stretch and shear about what the motion predicts (surfaces are slanted)."""
     smoothing_px: float = 0.7
     """Standard deviation of the Gaussian ahead of alignment; it takes the bias of bilinear sampling away."""
     min_correlation: float = 0.8

@@ -34,6 +34,10 @@ class Sighting:
             self.left_px[mask], self.left_covariance[mask], self.right_px[mask], self.right_covariance[mask]
         )
 
+    def scaled(self, factor: float) -> "Sighting":
+        """The same with covariances multiplied by a factor."""
+        return Sighting(self.left_px, factor * self.left_covariance, self.right_px, factor * self.right_covariance)
+
     def append(self, other: "Sighting") -> "Sighting":
         """These features followed by others."""
         return Sighting(

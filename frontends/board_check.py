@@ -1,0 +1,159 @@
+"""Does a board look as the rig file says? Markers that are off their place, exchanged, or there twice."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from ..factors.camera import CameraModel
+from ..factors.measurements import MarkerSighting
+from ..factors.rig import Board, Noise
+from .board_fit import BoardFit, board_corners, fit_board
+from .board_pose import board_pose_candidates
+
+Float = NDArray[np.float64]
+
+_FALSE_ALARM = 1e-5
+"""Probability of naming a marker that is in its place, per marker and image."""
+_SHIFT_DOF = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Suspicion:
+    """A marker that does not stand where the rig says."""
+
+    marker: int
+    kind: Literal["moved", "swapped", "duplicate", "inconsistent"]
+    """`moved`: off its place; `swapped`: the exchange of two ids explains the image; `duplicate`: the id was seen twice
+    and this one does not fit; `inconsistent`: two markers contradict each other, and the image cannot tell which."""
+    shift_m: tuple[float, float]
+    """Where it is from where it should be, on the page."""
+    shift_sigma_m: float
+    """Of the shift's length, board tolerance included."""
+    turn_rad: float
+    turn_sigma_rad: float
+    chi2: float
+    """What letting this marker free takes off the sum of squares; three degrees of freedom."""
+    limit: float
+    other: int | None = None
+    """The id that it was exchanged with."""
+
+
+def suspicious_markers(
+    sightings: Sequence[MarkerSighting],
+    board: Board,
+    camera: CameraModel,
+    side_m: float,
+    common_px: float = Noise().marker_common_px,
+) -> list[Suspicion]:
+    """Markers of one board, in one image, that contradict the others.
+
+    Each marker in turn may shift and turn on the page; the one whose freedom takes most off chi-square is named if that
+    is more than chance and the board's tolerance do, and left out; then the rest is looked at again. With fewer than
+    two markers nothing can be said.
+    """
+    found: list[Suspicion] = []
+    rest = list(sightings)
+    doubles = {s.marker for s in rest if sum(1 for o in rest if o.marker == s.marker) > 1}
+    while len(rest) > 1:
+        worst, index = _worst(rest, board, camera, side_m, common_px)
+        if worst is None:
+            break
+        if worst.marker in doubles and sum(1 for s in rest if s.marker == worst.marker) > 1:
+            worst = replace(worst, kind="duplicate")
+        if len(rest) == 2 and worst.kind == "moved":
+            found += [replace(worst, marker=s.marker, kind="inconsistent") for s in rest]
+            break
+        found.append(worst)
+        rest = rest[:index] + rest[index + 1 :]
+    return _exchanged(found, list(sightings), board, camera, side_m, common_px)
+
+
+def _worst(
+    sightings: list[MarkerSighting], board: Board, camera: CameraModel, side_m: float, common_px: float
+) -> tuple[Suspicion | None, int]:
+    """The most suspicious marker and its place in the list; None when all are where they should be."""
+    corners = board_corners(sightings, board, common_px)
+    best: tuple[float, int, BoardFit] | None = None
+    whole, _ = _fit(sightings, board, camera, side_m, common_px)
+    if whole is None:
+        return None, 0
+    for k in range(len(sightings)):
+        start, others = _fit([s for j, s in enumerate(sightings) if j != k], board, camera, side_m, common_px)
+        starts = [whole.camera_T_f, *([] if start is None else [start.camera_T_f]), *others]
+        freed = min((fit_board(corners, camera, pose, side_m, shifted=k) for pose in starts), key=lambda f: f.chi2)
+        if np.isfinite(freed.chi2) and (best is None or freed.chi2 < best[0]):
+            best = freed.chi2, k, freed
+    if best is None:
+        return None, 0
+    _, k, fit = best
+    suspicion = _suspicion(sightings[k].marker, fit, board)
+    return (suspicion if suspicion.chi2 > suspicion.limit else None), k
+
+
+def _fit(
+    sightings: list[MarkerSighting], board: Board, camera: CameraModel, side_m: float, common_px: float
+) -> tuple[BoardFit | None, list[Float]]:
+    """The best fit, and the poses of all candidates."""
+    candidates = board_pose_candidates(sightings, board, camera, side_m, common_px)
+    if not candidates:
+        return None, []
+    corners = board_corners(sightings, board, common_px)
+    return fit_board(corners, camera, candidates[0].camera_T_f, side_m), [c.camera_T_f for c in candidates]
+
+
+def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
+    """The shift against its covariance, to which the board's own tolerance is added."""
+    tolerance = np.diag([board.centre_sigma_m**2] * 2 + [(board.centre_sigma_m / board.side_m) ** 2])
+    scale = max(1.0, fit.chi2 / max(fit.dof, 1))
+    covariance = fit.covariance[6:, 6:] * scale + 2 * tolerance
+    shift, turn = fit.extra[:2], float(fit.extra[2])
+    length = float(np.linalg.norm(shift))
+    along = shift / length if length > 0 else np.array([1.0, 0.0])
+    return Suspicion(
+        marker,
+        "moved",
+        (float(shift[0]), float(shift[1])),
+        float(np.sqrt(along @ covariance[:2, :2] @ along)),
+        turn,
+        float(np.sqrt(covariance[2, 2])),
+        float(fit.extra @ np.linalg.solve(covariance, fit.extra)),
+        float(chi2_distribution.isf(_FALSE_ALARM, _SHIFT_DOF)),
+    )
+
+
+def _exchanged(
+    found: list[Suspicion],
+    sightings: list[MarkerSighting],
+    board: Board,
+    camera: CameraModel,
+    side_m: float,
+    common_px: float,
+) -> list[Suspicion]:
+    """Names pairs whose exchange mends the board."""
+    if not found or len(sightings) < 2:
+        return found
+    ids = [s.marker for s in sightings]
+    if len(set(ids)) < len(ids):
+        return found
+    before, _ = _fit(sightings, board, camera, side_m, common_px)
+    limit = float(chi2_distribution.isf(_FALSE_ALARM, 2 * 4 * len(ids)))
+    for a, b in combinations(range(len(ids)), 2):
+        if ids[a] not in {s.marker for s in found} and ids[b] not in {s.marker for s in found}:
+            continue
+        exchanged = [
+            replace(s, marker=ids[b] if k == a else ids[a] if k == b else s.marker) for k, s in enumerate(sightings)
+        ]
+        after, _ = _fit(exchanged, board, camera, side_m, common_px)
+        if after is not None and before is not None and after.chi2 < min(limit, 0.01 * before.chi2):
+            return [_pair(found, ids[a], ids[b]), _pair(found, ids[b], ids[a])]
+    return found
+
+
+def _pair(found: list[Suspicion], marker: int, other: int) -> Suspicion:
+    known = next((s for s in found if s.marker == marker), found[0])
+    return replace(known, marker=marker, kind="swapped", other=other)

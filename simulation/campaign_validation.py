@@ -1,0 +1,71 @@
+"""The page of results (Markdown): one section per campaign, each replaced when its campaign is run again."""
+
+from pathlib import Path
+
+from .campaign import write_whole
+from .campaign_report import label, quantity_text
+from .campaign_table import CampaignTable
+
+TITLE = "# Validation"
+INTRODUCTION = """
+Written by `surecut campaign ... --validation docs/validation.md`; do not edit by hand. Errors are truth less estimate.
+NEES is the squared error in units of the stated covariance; over many runs NEES/dof is 1 when the covariance is true,
+and stays in the interval given for it with 95 %. Coverage is how often a region of that content held the truth.
+"""
+
+
+def update_validation(path: Path, name: str, level: str, content: CampaignTable | str, stamp: str) -> None:
+    """Puts a section into the page, in the place of its predecessor or at the end."""
+    heading = f"## {name}, {level}"
+    body = content if isinstance(content, str) else validation_section(content)
+    sections = _sections(path.read_text(encoding="utf-8")) if path.exists() else {}
+    sections[heading] = f"{heading}\n{stamp}.\n\n{body.strip()}\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, "\n".join([TITLE, INTRODUCTION.strip(), "", *sections.values()]))
+
+
+def validation_section(table: CampaignTable) -> str:
+    """A campaign's table in Markdown."""
+    lines = [
+        f"{table.runs} runs, {table.failed} without a result. The consistency check passed in "
+        f"{100 * table.consistent:.1f} % ({100 * table.consistent_interval[0]:.1f} to "
+        f"{100 * table.consistent_interval[1]:.1f}); points beyond their 99.9 % region in runs that passed: "
+        f"{table.unflagged_beyond999}. {table.mean_seconds:.2f} s per estimate on one core.",
+        "",
+        "| quantity | mean | 95 % | worst | predicted rms | NEES/dof | accepted | in 50 / 90 / 95 / 99 % |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for summary in table.summaries:
+        shares = " / ".join(f"{100 * coverage.share:.1f}" for coverage in summary.coverage)
+        sizes = (summary.mean, summary.percentile95, summary.worst, summary.rms_sigma)
+        cells = " | ".join(quantity_text(size, summary.unit) for size in sizes)
+        accepted = f"{summary.nees_lower:.2f} to {summary.nees_upper:.2f}"
+        lines.append(f"| {label(summary)} | {cells} | {summary.nees_per_dof:.2f} | {accepted} | {shares} |")
+    if table.chain is not None:
+        sizes = (table.chain.mean, table.chain.percentile95, table.chain.worst)
+        cells = " | ".join(quantity_text(size, "m") for size in sizes)
+        lines.append(f"| the paper's chain, {table.chain.count} clicks | {cells} | | | | |")
+    families = ", ".join(f"{family} {value:.2f}" for family, value in table.chi2_per_dof.items())
+    lines += ["", f"chi2/dof by family: {families}."]
+    if table.left_out:
+        left = ", ".join(
+            f"{one.name} x {one.mean_error_ratio:.2f} (radius x {one.mean_radius_ratio:.2f}"
+            + (f", {one.failed} of {one.runs} without a result)" if one.failed else ")")
+            for one in table.left_out
+        )
+        lines.append(f"Mean error of the points without one family: {left}.")
+    if table.reasons:
+        lines.append("Without a result: " + "; ".join(f"{count} x {text}" for text, count in table.reasons.items()))
+    return "\n".join(lines)
+
+
+def _sections(text: str) -> dict[str, str]:
+    sections: dict[str, str] = {}
+    heading = ""
+    for line in text.splitlines():
+        if line.startswith("## "):
+            heading = line
+            sections[heading] = ""
+        if heading:
+            sections[heading] += line + "\n"
+    return sections

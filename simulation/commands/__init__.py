@@ -1,0 +1,1 @@
+"""Commands of the simulation: `surecut campaign` and others."""

@@ -1,0 +1,97 @@
+"""Simulate, estimate and evaluate many times: are the stated uncertainties true?"""
+
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from ...estimator.executor import choose_executor
+from ...factors.errors import SurecutError
+from ..campaign import open_campaign, run_campaign, write_whole
+from ..campaign_report import label, quantity_text, report_html
+from ..campaign_table import CampaignTable, tabulate, write_tables
+from ..campaign_validation import update_validation
+
+
+def command(
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder of the runs and tables; resumed if it is one.")
+    ],
+    runs: Annotated[int, typer.Option(min=1, help="Number of runs; run i has seed i.")] = 50,
+    scenario: Annotated[str, typer.Option(help="Scenario file (YAML), or the name of one that comes along.")] = "cell",
+    level: Annotated[
+        Literal["measurements", "pixels"],
+        typer.Option(help="Draw the measurements, or render images."),
+    ] = "measurements",
+    jobs: Annotated[int, typer.Option(min=1, help="Processes on this machine.")] = 1,
+    dask: Annotated[str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://host:8786.")] = None,
+    leave_out: Annotated[
+        bool, typer.Option("--leave-out", help="Estimate again without each family of measurements.")
+    ] = False,
+    validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
+) -> None:
+    """Runs a campaign and writes summary.json, summary.csv, quantities.csv and report.html."""
+    console = Console()
+    campaign = open_campaign(scenario, level, leave_out)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
+        task = progress.add_task("runs", total=runs)
+        executor = choose_executor(jobs, dask)
+        rows = run_campaign(output, campaign, runs, executor, lambda count: progress.advance(task, count))
+    table = tabulate(rows)
+    notes = [f"Scenario {scenario}, level {level}.", stamp()]
+    write_tables(output, table, rows)
+    write_whole(output / "report.html", report_html(f"Campaign {scenario}", table, rows, notes))
+    _print(console, table)
+    console.print(f"{output / 'report.html'}")
+    if validation is not None:
+        update_validation(validation, scenario, level, table, stamp())
+    if table.failed == table.runs:
+        raise SurecutError(f"no run gave a result; the first says: {next(iter(table.reasons))}")
+
+
+def stamp() -> str:
+    """Date and commit, for the record."""
+    here = Path(__file__).parent
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(here), "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+        )
+        commit = found.stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    return f"{datetime.now(UTC):%Y-%m-%d}, commit {commit}"
+
+
+def _print(console: Console, table: CampaignTable) -> None:
+    grid = Table(box=None, pad_edge=False)
+    for name in ("quantity", "runs", "mean", "worst", "NEES/dof", "accepted", "in 95 %"):
+        grid.add_column(name, justify="left" if name == "quantity" else "right")
+    for summary in table.summaries:
+        at95 = next(coverage for coverage in summary.coverage if coverage.level == 0.95)
+        grid.add_row(
+            label(summary),
+            str(summary.runs),
+            quantity_text(summary.mean, summary.unit),
+            quantity_text(summary.worst, summary.unit),
+            f"{summary.nees_per_dof:.2f}",
+            f"{summary.nees_lower:.2f} to {summary.nees_upper:.2f}",
+            f"{100 * at95.share:.1f} %",
+        )
+    if table.chain is not None:
+        grid.add_row(
+            "paper's chain",
+            str(table.chain.count),
+            quantity_text(table.chain.mean, "m"),
+            quantity_text(table.chain.worst, "m"),
+        )
+    console.print(grid)
+    console.print(
+        f"{table.runs} runs, {table.failed} without a result; consistency check passed in "
+        f"{100 * table.consistent:.1f} %; {table.mean_seconds:.2f} s per estimate"
+    )
