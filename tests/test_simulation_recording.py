@@ -2,6 +2,7 @@
 
 import hashlib
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -156,3 +157,13 @@ def test_length_of_the_path(eventful, motion, low, high):
     w_T_c = eventful.motion.chassis(0.0)
     lengths = [plan(scenario, eventful.cell, w_T_c, np.random.default_rng(seed)).length_m(30.0) for seed in range(8)]
     assert low < np.mean(lengths) < high
+
+
+def test_compressed_images_decode(tmp_path):
+    path = tmp_path / "jpeg.mcap"
+    simulate(path, small(duration_s=1.0, jpeg_quality=90, kinect={"width": 80, "height": 60, "rate_hz": 1.0}), 2)
+    messages, _ = read(path)
+    first = messages["/m/left/image_raw"][0]
+    assert first.format == "jpeg"
+    assert cv2.imdecode(first.data, cv2.IMREAD_UNCHANGED).shape == (80, 120)
+    assert messages["/b/depth/image_raw"][0].encoding == "16UC1"
