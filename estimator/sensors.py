@@ -1,6 +1,5 @@
 """The front ends of one run: opened when their camera's calibration is known, fed with images, giving measurements."""
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import cast
@@ -26,7 +25,8 @@ Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 DEPTH_FRAMES = 10
-"""Depth images of a still machine that are averaged before surfaces are read from them."""
+DEPTH_WINDOW_NS = 2_000_000_000
+"""Depth images of a still machine that are averaged before surfaces are read from them: so many, or so long."""
 MATCH_SIGMA_PX = 0.5
 """Disparity error of semi-global matching on a window's median (OpenCV, one pixel steps interpolated to 1/16)."""
 
@@ -57,7 +57,7 @@ class Sensors:
         self._markers: dict[str, MarkerFrontEnd] = {}
         self._outlines: dict[str, OutlineFinder] = {}
         self._clouds: CloudFrontEnd | None = None
-        self._depths: deque[NDArray[np.float32]] = deque(maxlen=DEPTH_FRAMES)
+        self._depths: list[tuple[int, NDArray[np.float32]]] = []
         self.rejected: list[Rejection] = []
 
     def calibrate(self, camera: str, model: CameraModel) -> None:
@@ -157,10 +157,10 @@ class Sensors:
             camera = self._camera("b_depth")
             self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)
             self._clouds = CloudFrontEnd(camera, self.rig.kinect.model)
-        self._depths.append(depth_m)
-        if len(self._depths) < DEPTH_FRAMES:
+        self._depths.append((stamp_ns, depth_m))
+        if len(self._depths) < DEPTH_FRAMES and stamp_ns - self._depths[0][0] < DEPTH_WINDOW_NS:
             return None
-        mean = average_depth(np.stack(self._depths))
+        mean = average_depth(np.stack([depth for _, depth in self._depths]))
         count = len(self._depths)
         self._depths.clear()
         return self._clouds.process(stamp_ns, mean, count)
