@@ -30,6 +30,7 @@ def rig_of(log: LogReader, given: Path | None) -> Rig:
         return load_rig(given)
     text = log.attachment("rig.yaml")
     if text is None:
+        next(log.raw(), None)  # what is no recording at all is told first
         raise LogError(f"{log.name}: carries no rig.yaml; give the rig file with --rig (`surecut rig --example`)")
     return load_rig(text, f"{log.name}: rig.yaml")
 

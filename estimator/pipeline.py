@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ..factors.errors import LogError, ObservabilityError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
+from ..frontends.fiducials.messages import UNKNOWN_IDS
 from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import predict_outline
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
@@ -160,6 +161,7 @@ class Pipeline:
             ObservabilityError: a pick in a camera that nothing places.
         """
         self.engine.revisit()
+        self._check_ids()
         report = self.pairing
         if report.pairs == 0 and report.unpaired and not self.engine.odometry.keyframe_stamps:
             counts = ", ".join(f"{topic} {count}" for topic, count in sorted(report.unpaired.items()))
@@ -174,6 +176,17 @@ class Pipeline:
                     "view; pick the point again from another place"
                 )
         self._check_open_picks()
+
+    def _check_ids(self) -> None:
+        """Markers were seen, and none of them is on a board."""
+        if self.engine.odometry.keyframe_stamps:
+            return
+        for refused in self.sensors.rejected:
+            if refused.reason.startswith(UNKNOWN_IDS):
+                raise LogError(
+                    f"no known marker was seen: at {refused.stamp_ns} ns {refused.what} are on no board of the rig; "
+                    "correct dictionary and marker ids in the rig file"
+                )
 
     def _check_open_picks(self) -> None:
         """A point all of whose picks hang on nothing."""
