@@ -223,6 +223,24 @@ def acceptance_intervals(all_families: tuple[FamilyConsistency, ...]) -> Figure:
     return Figure(WIDTH, height + 12, tuple(strokes), "Chi-square per degree of freedom against its limits")
 
 
+def residual_tenths(families: list[FamilyConsistency]) -> Figure:
+    """One small histogram for each family: how its residuals fill the tenths of their expected distribution."""
+    columns, width, height, row = 4, WIDTH / 4 - 12, 44.0, 70.0
+    strokes: list[Stroke] = []
+    for index, family in enumerate(families):
+        x, y = (index % columns) * WIDTH / columns, (index // columns) * row + 12
+        total, step = max(sum(family.tenths), 1), width / len(family.tenths)
+        even = height / 2.5
+        strokes.append(Label(x, y - 3, shortened(family.family, 26), 8))
+        for tenth, count in enumerate(family.tenths):
+            high = min(count / total * len(family.tenths) * even, height)
+            strokes.append(rectangle(x + tenth * step, y + height - high, step, high, pen=0.4, grey=0.2, fill=0.72))
+        strokes.append(line(x, y + height - even, x + width, y + height - even, pen=0.8, dash=(3, 2)))
+        strokes.append(line(x, y + height, x + width, y + height, pen=0.6))
+    rows = -(-len(families) // columns)
+    return Figure(WIDTH, rows * row - 10, tuple(strokes), "Residuals against their expected distribution")
+
+
 def shortened(name: str, letters: int = 36) -> str:
     """A label that fits beside a bar."""
     return name if len(name) <= letters else f"{name[: letters - 1]}…"

@@ -106,6 +106,24 @@ def register(
     return _lost(pose, config) if pairs is None else _summary(pose, pairs, len(cloud_b.points_m), converged, config)
 
 
+def small_motion(reference: SurfaceMap, cloud: CloudFrame, reach_m: float = 0.08) -> Float | None:
+    """First guess of a small motion of the camera since `reference` was taken: one step of the registration.
+
+    Cheap, and good to tell still from moving; directions that the geometry leaves free come out as no motion.
+
+    Returns:
+        Tangent (6,), rotation first, or None where fewer than half of the samples have a partner.
+    """
+    pairs = _Pairs.find(reference, cloud, np.eye(4), reach_m, np.deg2rad(35.0))
+    if pairs is None or len(pairs.residual) < 0.5 * len(cloud.points_m):
+        return None
+    normal = pairs.jacobian.T @ (pairs.weight[:, None] * pairs.jacobian)
+    values, vectors = np.linalg.eigh(normal)
+    held = values > 1e-3 * values[-1]
+    gradient = -pairs.jacobian.T @ (pairs.weight * pairs.residual)
+    return vectors[:, held] @ ((vectors[:, held].T @ gradient) / values[held])
+
+
 @dataclass(frozen=True, slots=True)
 class _Pairs:
     residual: Float

@@ -141,9 +141,7 @@ def _distinct(points: Float, point: Float, direction: Float, radius: Float, scor
     middle = np.median(points, axis=0)
     for i in np.argsort(-score):
         axis = Axis.of(point[i], direction[i], radius[i], middle)
-        if all(
-            axis.angle_to(other) > 0.15 or abs(axis.radius - other.radius) > 0.2 * other.radius for other in chosen
-        ):
+        if all(axis.angle_to(other) > 0.15 or abs(axis.radius - other.radius) > 0.2 * other.radius for other in chosen):
             chosen.append(axis)
         if len(chosen) == count:
             break

@@ -96,7 +96,9 @@ def fit_cylinder(
     starts = candidates(used[sample], normals, noise[sample], config.seed, seed_axis, radius_prior_m,
                         (config.smallest_radius_m, config.largest_radius_m))  # fmt: skip
     thin = sample[:_THIN]
-    fits = [f for f in (_Fit.robust(used[thin], noise[thin], s, radius_prior_m, config) for s in starts) if f is not None]
+    fits = [
+        f for f in (_Fit.robust(used[thin], noise[thin], s, radius_prior_m, config) for s in starts) if f is not None
+    ]
     chosen = max(fits, key=lambda f: f.score, default=None)
     best = None if chosen is None else _Fit.robust(used, noise, chosen.axis, radius_prior_m, config)
     if best is None:

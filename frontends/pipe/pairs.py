@@ -55,6 +55,8 @@ class EdgePair:
     """Log-likelihood by geometry and support."""
     surprise: float
     """Chi-square of middle and width (and direction) against the prior."""
+    region: float = 0.0
+    """Log-likelihood ratio that a pipe fills the space between, see `surface.region_score`."""
 
 
 def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limits: PairLimits) -> list[EdgePair]:
@@ -70,7 +72,9 @@ def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limi
     return sorted(pairs, key=lambda pair: -pair.score)
 
 
-def _pair(first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits) -> EdgePair | None:
+def _pair(
+    first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits
+) -> EdgePair | None:
     turn, rho = _aligned(first, second)
     if abs(turn) > np.deg2rad(25.0):
         return None
