@@ -96,19 +96,16 @@ class LinearSystem:
         middle = csr_matrix(self.A.T @ self.A.multiply(self.inflation[:, None])) if inflated else None
         for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys]):
             columns = [self.columns[keys[i]] for i in chunk]
-            right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
-            own, at = [], 0
-            for column in columns:
-                width = column.stop - column.start
-                own.append(slice(at, at + width))
-                right[column, own[-1]] = np.eye(width)
-                at += width
-            inverse = self.solve(right)
             if middle is None:
-                found += [inverse[column, place].copy() for column, place in zip(columns, own, strict=True)]
-            else:
-                outer = middle @ inverse
-                found += [inverse[:, place].T @ outer[:, place] for place in own]
+                found += self._normal.inverse_blocks(columns)
+                continue
+            right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
+            at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
+            for column, start, stop in zip(columns, at[:-1], at[1:], strict=True):
+                right[column, start:stop] = np.eye(stop - start)
+            inverse = self.solve(right)
+            outer = middle @ inverse
+            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in zip(at[:-1], at[1:], strict=True)]
         return found
 
     def hats(self, positions: Sequence[int]) -> list[Float]:

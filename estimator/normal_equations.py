@@ -1,7 +1,7 @@
 """Sparse normal equations solved in two steps: variables that only touch the rest are eliminated block by block, the
 rest is solved densely (the Schur complement of bundle adjustment; Triggs et al. 2000, section 6)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,30 @@ class NormalEquations:
         x[self._rest] = self._solve_rest(right[self._rest] - self._gain.T @ own)
         x[self._leaf] = self._inverse @ own - self._gain @ x[self._rest]
         return x
+
+    def inverse_blocks(self, columns: Sequence[slice]) -> list[Float]:
+        """Diagonal blocks of `H^-1`. Those of eliminated variables need a solution of the rest only."""
+        place = np.empty(self._size, np.int64)
+        place[self._leaf] = np.arange(len(self._leaf))
+        place[self._rest] = np.arange(len(self._rest))
+        is_leaf = np.zeros(self._size, bool)
+        is_leaf[self._leaf] = True
+        index = np.concatenate([np.arange(c.start, c.stop) for c in columns])
+        right = np.zeros((len(index), len(self._rest)))
+        leaf = is_leaf[index]
+        right[leaf] = self._gain[place[index[leaf]]].toarray()
+        right[np.flatnonzero(~leaf), place[index[~leaf]]] = 1.0
+        inverse = right @ self._solve_rest(right.T)
+        blocks, at = [], 0
+        for column in columns:
+            width = column.stop - column.start
+            block = inverse[at : at + width, at : at + width].copy()
+            if is_leaf[column.start]:
+                own = slice(place[column.start], place[column.start] + width)
+                block += self._inverse[own, own].toarray()
+            blocks.append(block)
+            at += width
+        return blocks
 
     def _blocks_inverted(self, H: csr_matrix) -> csr_matrix:
         """Inverse of the block-diagonal part, by runs of equal width."""
