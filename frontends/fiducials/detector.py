@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, MarkerSighting, Rejection
 from ...factors.rig import Board, Rig
-from ..undistort import distort, undistort
+from ..undistort import distort, undistort, undistorted_grid
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
 from .pattern_fit import PatternFit, Window, fit_patterns, surroundings
@@ -27,7 +27,7 @@ _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
 """Of the pattern's edges, what has to be seen as the model says."""
-_SETTLED_PX = 0.1
+_SETTLED_PX = 0.3
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
 
@@ -73,8 +73,7 @@ class MarkerFrontEnd:
         self._search = MarkerSearch(tuple(self._dictionaries.values()))
         self._positions: Float | None = None
         if not _is_pinhole(camera):
-            columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-            self._positions = undistort(camera, np.stack([columns, rows], -1))[0]
+            self._positions = undistorted_grid(camera)
 
     def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> tuple[list[MarkerSighting], list[Rejection]]:
         """The markers in one image, and what was refused.

@@ -170,7 +170,13 @@ def _converged(pixels: _Pixels) -> _State | None:
 
 
 def _gather(
-    grey: Float, px: Float, line: Float, foot_px: Float, span: tuple[float, float], half_width_px: float, noise: float,
+    grey: Float,
+    px: Float,
+    line: Float,
+    foot_px: Float,
+    span: tuple[float, float],
+    half_width_px: float,
+    noise: float,
     window: tuple[float, float],
 ) -> _Pixels | None:
     outside, deepest = window
@@ -287,9 +293,7 @@ def _larger(a: Float, b: Float) -> Float:
     return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
 
 
-def _result(
-    line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float
-) -> EdgeFit | None:
+def _result(line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float) -> EdgeFit | None:
     linear = _linearise(pixels, state)
     weights = _weights(linear)
     good = (linear.shift_sigma < 0.5) & (weights > 0.1)

@@ -70,7 +70,9 @@ def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limi
     return sorted(pairs, key=lambda pair: -pair.score)
 
 
-def _pair(first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits) -> EdgePair | None:
+def _pair(
+    first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits
+) -> EdgePair | None:
     turn, rho = _aligned(first, second)
     if abs(turn) > np.deg2rad(25.0):
         return None

@@ -150,7 +150,10 @@ class OutlineFinder:
             else:
                 found.append(_Found(pair, (both[0], both[1]), pair.score))
         blur = _sharp_blur(fits.values())
-        return [f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits)) for f in found]
+        return [
+            f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
+            for f in found
+        ]
 
     @staticmethod
     def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
