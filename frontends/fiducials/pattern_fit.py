@@ -15,12 +15,14 @@ edge line k at the blur's width there, and a first-order term for grid lines tha
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
+# NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
+Float = NDArray[Any]
+Single = NDArray[Any]
 Window = tuple[int, int, int, int]
 Windows = Sequence[Window]
 
@@ -277,8 +279,8 @@ def _near_edges(
     a, b = a[inside], b[inside]
     corners = (H @ np.column_stack([_UNIT, np.ones(4)]).T).T
     corners = corners[:, :2] / corners[:, 2:]
-    u = np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3]) / 2
-    v = np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1]) / 2
+    u = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
+    v = float(np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1])) / 2
     near = _edge_within(a, b, pattern, reach_px * cells / u) | _edge_within(b, a, pattern.T, reach_px * cells / v)
     index = (rows * width + columns)[inside][near]
     scatter = (index * 2654435761) % 4294967296
