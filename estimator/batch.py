@@ -10,6 +10,7 @@ from ..factors.measurements import Rejection
 from ..factors.noise import huber_norm, robust_scale
 from .graph import FactorLog
 from .linear import LinearSystem
+from .observability import determined
 
 Float = NDArray[np.float64]
 
@@ -58,7 +59,8 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[g
     parameters.setMaxIterations(40)
     parameters.setlambdaInitial(1e-8)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    values = optimiser.optimize()
+    with determined():
+        values = optimiser.optimize()
     return values, optimiser.iterations()
 
 

@@ -21,6 +21,7 @@ from ..frontends.pipe.silhouette import OutlineFinder
 from ..frontends.stereo.frontend import StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
+from .sides import swapped
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -29,6 +30,11 @@ DEPTH_FRAMES = 10
 """Depth images of a still machine that are averaged before surfaces are read from them."""
 MATCH_SIGMA_PX = 0.5
 """Disparity error of semi-global matching on a window's median (OpenCV, one pixel steps interpolated to 1/16)."""
+
+ENOUGH_MATCHES = 20
+"""Features in both images of a pair that leave no doubt about which is left."""
+UNMATCHED_PAIRS = 3
+"""Pairs from the start on in which exchanged sides are looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +64,8 @@ class Sensors:
         self._outlines: dict[str, OutlineFinder] = {}
         self._clouds: CloudFrontEnd | None = None
         self._depths: deque[NDArray[np.float32]] = deque(maxlen=DEPTH_FRAMES)
+        self._unmatched = 0
+        """Pairs from the start on that had hardly a feature in common."""
         self.rejected: list[Rejection] = []
 
     def calibrate(self, camera: str, model: CameraModel) -> None:
@@ -88,9 +96,28 @@ class Sensors:
             left, right = self._camera("m_left"), self._camera("m_right")
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
-            pose = left_T_right(left, right, self.rig.stereo).matrix()
-            self._stereo = StereoFrontEnd(left, right, pose)
-        return self._stereo.process(pair.stamp_ns, pair.left, pair.right)
+            self._stereo = StereoFrontEnd(left, right, self.left_T_right())
+        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right)
+        if self._unmatched < UNMATCHED_PAIRS:
+            self._check_sides(pair, frame)
+        return frame
+
+    def left_T_right(self) -> Float:
+        """Nominal pose of the right mobile camera in the left one, (4, 4)."""
+        return left_T_right(self._camera("m_left"), self._camera("m_right"), self.rig.stereo).matrix()
+
+    def _check_sides(self, pair: PairImages, frame: StereoFrame) -> None:
+        """The first pairs: where hardly a feature of the left image is in the right one, are they exchanged?"""
+        matches = _matched(frame)
+        if matches >= ENOUGH_MATCHES:
+            self._unmatched = UNMATCHED_PAIRS
+            return
+        self._unmatched += 1
+        other = StereoFrontEnd(self._camera("m_left"), self._camera("m_right"), self.left_T_right())
+        exchanged = _matched(other.process(pair.stamp_ns, pair.right, pair.left))
+        if exchanged >= ENOUGH_MATCHES and exchanged > 4 * matches:
+            evidence = f"at {pair.stamp_ns} ns: {matches} features are in both images, {exchanged} when exchanged"
+            raise swapped(self.rig, evidence)
 
     def _camera(self, name: str) -> CameraModel:
         if name not in self.cameras:
@@ -199,6 +226,10 @@ class Sensors:
         if camera not in self._outlines:
             self._outlines[camera] = OutlineFinder(self.cameras[camera])
         return self._outlines[camera]
+
+
+def _matched(frame: StereoFrame) -> int:
+    return int(np.isfinite(frame.right_px).all(axis=1).sum())
 
 
 def by_info_topic(rig: Rig) -> Mapping[str, str]:
