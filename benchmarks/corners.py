@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from surecut.factors.camera import CameraModel
 from surecut.factors.rig import Board, Marker, Rig
 from surecut.frontends.fiducials.detector import MarkerFrontEnd
+from surecut.frontends.fiducials.dictionaries import marker_dictionary
 from surecut.simulation.marker_images import Photography, marker_corners, project, render_board
 
 Float = NDArray[np.float64]
@@ -51,6 +52,8 @@ class Row:
     sigma: float
     nees_per_dof: float
     largest: float
+    opencv: dict[str, tuple[float, float, int]]
+    """Outward bias, rms and number of markers of OpenCV's refinements, its half pixel taken off the AprilTag one."""
 
 
 def board(dictionary: str) -> Board:
@@ -99,20 +102,23 @@ def measure(condition: Condition, images: int, seed: int) -> Row:
     """Errors of one condition over some images with random roll, tilt direction, place and light."""
     rng = np.random.default_rng(seed)
     errors, outwards, nees, sigmas, wanted = [], [], [], [], 0
+    others: dict[str, list[tuple[Float, Float]]] = {}
     for _ in range(images):
         image, truth, camera = photograph(condition, rng)
         front_end = MarkerFrontEnd(Rig(boards=(board(condition.dictionary),)), camera, "m_left")
         wanted += len(truth)
+        for name, pairs in opencv_errors(image, truth, condition.dictionary).items():
+            others.setdefault(name, []).extend(pairs)
         for sighting in front_end.process(0, image)[0]:
             true = truth[sighting.marker]
             error = sighting.corners_px - true
-            away = true - true.mean(0)
             errors.append(error)
-            outwards.append((error * away).sum(1) / np.linalg.norm(away, axis=1))
+            outwards.append(outward(error, true))
             nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(sighting.covariance_px2), error) / 2)
             sigmas.append(np.einsum("kii->k", sighting.covariance_px2) / 2)
+    opencv = {name: compared(pairs) for name, pairs in others.items()}
     if not errors:
-        return Row(condition, wanted, 0, *([float("nan")] * 7))
+        return Row(condition, wanted, 0, *([float("nan")] * 7), opencv)
     error = np.stack(errors)
     return Row(
         condition,
@@ -125,7 +131,39 @@ def measure(condition: Condition, images: int, seed: int) -> Row:
         float(np.sqrt(np.mean(sigmas))),
         float(np.mean(nees)),
         float(np.abs(error).max()),
+        opencv,
     )
+
+
+def opencv_errors(
+    image: NDArray[np.uint8], truth: dict[int, Float], dictionary: str
+) -> dict[str, list[tuple[Float, Float]]]:
+    """Errors and true corners of the markers, by refinement."""
+    known = marker_dictionary(dictionary)
+    result: dict[str, list[tuple[Float, Float]]] = {}
+    for name in ("NONE", "SUBPIX", "APRILTAG"):
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = getattr(cv2.aruco, f"CORNER_REFINE_{name}")
+        corners, ids, _ = cv2.aruco.ArucoDetector(known.opencv, parameters).detectMarkers(image)
+        result[name] = []
+        for marker, found in zip([] if ids is None else np.ravel(ids), corners, strict=True):
+            if int(marker) in truth:
+                ours = np.asarray(found, float).reshape(4, 2)[list(known.from_opencv)]
+                ours = ours - (0.5 if name == "APRILTAG" else 0.0)
+                result[name].append((ours - truth[int(marker)], truth[int(marker)]))
+    return result
+
+
+def outward(error: Float, true: Float) -> Float:
+    away = true - true.mean(0)
+    return (error * away).sum(1) / np.linalg.norm(away, axis=1)
+
+
+def compared(pairs: list[tuple[Float, Float]]) -> tuple[float, float, int]:
+    if not pairs:
+        return float("nan"), float("nan"), 0
+    errors = np.stack([error for error, _ in pairs])
+    return float(np.mean([outward(*pair) for pair in pairs])), float(np.sqrt((errors**2).mean())), len(pairs)
 
 
 def conditions() -> list[Condition]:
@@ -155,7 +193,8 @@ def main() -> None:
         print(
             f"{c.side_px:4.0f} {c.tilt_deg:4.0f} {c.blur_px:4.1f} {c.noise:5.1f} {c.motion_px:6.1f} {c.white:5.0f} "
             f"{c.dictionary:12s} {row.found:3d}/{row.wanted:3d} {row.outward:+8.4f} "
-            f"{row.rms:8.4f} {row.sigma:8.4f} {row.nees_per_dof:8.2f} {row.largest:8.3f}",
+            f"{row.rms:8.4f} {row.sigma:8.4f} {row.nees_per_dof:8.2f} {row.largest:8.3f}   "
+            + "  ".join(f"{name} {o[0]:+.3f} {o[1]:.3f} {o[2]}" for name, o in row.opencv.items()),
             flush=True,
         )
     if arguments.json:

@@ -54,7 +54,9 @@ def family_tests(
         soft = int(sum(n > 3.0 * np.sqrt(f.dim()) for n, (f, _) in zip(norms, members, strict=True)))
         total = float((norms**2).sum())
         lower, upper = limits(dof)
-        tests.append(FamilyConsistency(family, total, dof, lower, upper, len(members), soft))
+        ranks = chi2.cdf(norms**2, [f.dim() for f, _ in members])
+        tenths = tuple(int(n) for n in np.histogram(ranks, 10, (0.0, 1.0))[0])
+        tests.append(FamilyConsistency(family, total, dof, lower, upper, len(members), soft, tenths))
     return tuple(tests)
 
 

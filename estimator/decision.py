@@ -7,12 +7,12 @@ stated probability is never more than the true one. NO-GO where no further measu
 coarse, or the place itself is forbidden. All else is MEASURE MORE, and so is every doubt about the estimate as such.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from ..factors.rig import Cut, Rig
@@ -203,11 +203,22 @@ def _blockers(
         f"the record holds an error ({event.text.rstrip('.')})" for event in result.events if event.severity == "error"
     ]
     found += _trust_expired(cut, result)
+    newest = _newest_station(result)
+    if newest is not None and re.fullmatch(r"b\d+", point.frame) and point.frame != newest:
+        found.append(
+            f"the machine has been moved since: {point.id} is given in {point.frame}, it now stands at {newest}"
+        )
     if validated is None:
         found.append("the stated uncertainty has not been validated against truth (no validated range is installed)")
     else:
         found += validated.outside(result, point)
     return tuple(found)
+
+
+def _newest_station(result: Result) -> str | None:
+    """The last of the stations `b0`, `b1`, ... where the machine has been moved."""
+    numbers = [int(pose.name[1:]) for pose in result.poses if re.fullmatch(r"b\d+", pose.name)]
+    return f"b{max(numbers)}" if numbers else None
 
 
 def _trust_expired(cut: Cut, result: Result) -> list[str]:
@@ -318,18 +329,20 @@ def _all_hold(requirements: tuple[Requirement, ...]) -> float:
 
 
 def _margin(cut: Cut, point: PointEstimate, obstacles: tuple[Obstacle, ...], required: float) -> float | None:
-    """Root of P(factor) = required over the logarithm of the factor; the probability falls as the factor grows."""
+    """Bisection over the logarithm of the factor; the probability falls as the factor grows."""
 
-    def spare(logarithm: float) -> float:
+    def holds(logarithm: float) -> bool:
         covariance = np.exp(2 * logarithm) * point.covariance_m2
         rows = (_clearance(cut, covariance, obstacle).probability for obstacle in obstacles)
-        return tolerance_probability(cut, covariance, point.axis) - sum(1 - row for row in rows) - required
+        return tolerance_probability(cut, covariance, point.axis) - sum(1 - row for row in rows) >= required
 
     low, high = np.log(SCALES)
-    if spare(low) < 0 or spare(high) >= 0:
+    if not holds(low) or holds(high):
         return None
-    root, _ = brentq(spare, low, high, xtol=1e-4, full_output=True, disp=False)
-    return float(np.exp(root))
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return float(np.exp(low))
 
 
 def _notes(cut: Cut, point: PointEstimate | None, obstacles: tuple[Obstacle, ...]) -> tuple[str, ...]:

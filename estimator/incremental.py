@@ -13,19 +13,19 @@ Float = NDArray[np.float64]
 # Relinearise when a variable moved by more than this, per component of its tangent (m, rad, px): small against any
 # sigma that is ever reported, so that the incremental solution stays within a tenth of a sigma of the batch one.
 _THRESHOLDS = {
-    "x": [5e-4] * 3 + [5e-4] * 3,
-    "f": [5e-4] * 3 + [5e-4] * 3,
-    "b": [5e-4] * 3 + [5e-4] * 3,
-    "e": [1e-4] * 3 + [2e-4] * 3,
-    "l": [5e-3] * 3,
-    "q": [5e-4] * 3,
-    "p": [1e-3] * 3,
-    "u": [1e-3] * 3,
-    "v": [1e-3] * 3,
-    "h": [5e-5, 5e-4],
-    "r": [5e-4],
-    "k": [0.1, 0.1, 1.0, 0.1, 0.1, 5e-4, 5e-4, 5e-4, 5e-4],
-    "d": [1e-3, 1e-3],
+    "x": [1e-4] * 3 + [1e-4] * 3,
+    "f": [1e-4] * 3 + [1e-4] * 3,
+    "b": [1e-4] * 3 + [1e-4] * 3,
+    "e": [1e-5] * 3 + [2e-5] * 3,
+    "l": [1e-3] * 3,
+    "q": [1e-4] * 3,
+    "p": [2e-4] * 3,
+    "u": [2e-4] * 3,
+    "v": [2e-4] * 3,
+    "h": [1e-5, 1e-4],
+    "r": [1e-4],
+    "k": [0.01, 0.01, 1.0, 0.01, 0.01, 1e-4, 1e-4, 1e-4, 1e-4],
+    "d": [2e-4, 2e-4],
 }
 
 RELINEARIZE_EVERY = 10

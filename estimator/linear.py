@@ -47,6 +47,8 @@ class LinearSystem:
         self.b = np.zeros(shape[0])
         self.b[i[~keep]] = entries[2][~keep]
         information = csc_matrix(self.A.T @ self.A)
+        self.inflation = np.ones(shape[0])
+        """Variance of each row's error over what its whitening says, for errors that are correlated among rows."""
         self._factor = splu(
             information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
@@ -67,13 +69,17 @@ class LinearSystem:
         return full
 
     def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
-        """`A (A^T A)^-1 J^T`, shape (rows, m): its columns' squares, row by row, are the contributions."""
-        return self.A @ self.solve(self.selector(blocks))
+        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: the squares of its rows are the contributions.
+
+        With C = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the larger errors
+        (the sandwich form, Huber 1967).
+        """
+        return np.sqrt(self.inflation)[:, None] * (self.A @ self.solve(self.selector(blocks)))
 
     def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:
-        """`J (A^T A)^-1 J^T`, shape (m, m)."""
-        J = self.selector(blocks)
-        return J.T @ self.solve(J)
+        """Covariance of `J x`, shape (m, m)."""
+        influence = self.influence(blocks)
+        return influence.T @ influence
 
     def joint(self, keys: Sequence[int]) -> Float:
         """Joint covariance of some variables, in the order of `keys`."""

@@ -164,8 +164,8 @@ class Pipeline:
             if not point.known:
                 pick = point.held[-1][1]
                 raise LogError(
-                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no second "
-                    "view; pick the point again from another place"
+                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no "
+                    "second view; pick the point again from another place"
                 )
 
     # Outlines -------------------------------------------------------------------------------------------------

@@ -105,6 +105,9 @@ class FamilyConsistency:
     """Acceptance limits of chi2 / dof."""
     residuals: int
     downweighted: int
+    tenths: tuple[int, ...] = ()
+    """Number of residuals in each tenth of the chi-square distribution that they ought to have: even where the stated
+    uncertainties are right, leaning to the left where they are cautious, piled up at the right where they are not."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,8 @@ class Sensors:
         info = self.rig.cameras.m_right.info_topic
         if baseline < 0 or (baseline == 0 and left > 0):
             raise LogError(
-                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; exchange their topics in the rig file"
+                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; "
+                "exchange their topics in the rig file"
             )
         if baseline == 0:
             raise LogError(f"{info}: no baseline in P[3]; give stereo.m_left_T_m_right in the rig file")
@@ -96,7 +97,8 @@ class Sensors:
         if name not in self.cameras:
             topic = getattr(self.rig.cameras, name).info_topic
             raise LogError(
-                f"{topic}: no calibration of {name} before its first image; record camera_info or correct the topic in the rig file"
+                f"{topic}: no calibration of {name} before its first image; "
+                "record camera_info or correct the topic in the rig file"
             )
         return self.cameras[name]
 
@@ -105,7 +107,8 @@ class Sensors:
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise LogError(
-                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; record the camera_info that belongs to the images"
+                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; "
+                "record the camera_info that belongs to the images"
             )
 
     def depth_under(self, pick: Pick, pair: PairImages) -> tuple[float, float] | None:
@@ -180,7 +183,8 @@ class Sensors:
         u, v = (float(x) for x in body.px)
         if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
             raise LogError(
-                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of {body.camera}; pick again"
+                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of "
+                f"{body.camera}; pick again"
             )
         if body.role not in ("grasp", "cut", "other"):
             raise LogError(f"{where} has role {body.role!r}; roles are grasp, cut and other")

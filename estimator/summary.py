@@ -12,10 +12,12 @@ from ..factors.geometry import ros_covariance
 from ..factors.rig import dump_rig
 from .batch import BatchSolution
 from .consistency import family_tests, judge, prior_tests
+from .correlation import track_inflation
 from .engine import Engine
 from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
+from .odometry import FAMILY as ODOMETRY
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
     CalibrationEstimate,
@@ -47,6 +49,10 @@ class Summary:
             graph.add(factor)
         self._graph = graph
         self._system = LinearSystem(graph, solution.values)
+        records = [record for _, _, record in self._active]
+        self._inflation = track_inflation(records, self._system, ODOMETRY)
+        of_tracks = np.array([r.family == ODOMETRY for r in records])
+        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = self._inflation
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -163,7 +169,7 @@ class Summary:
         """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
         marginals = gtsam.Marginals(self._graph, self._values)
         count = self._engine.odometry.last_keyframe + 1
-        return [marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
+        return [self._inflation * marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
 
     # Calibration and distances --------------------------------------------------------------------------------
 

@@ -20,6 +20,8 @@ Float = NDArray[np.float64]
 _FALSE_ALARM = 1e-5
 """Probability of naming a marker that is in its place, per marker and image."""
 _SHIFT_DOF = 3
+_MENDED = 0.02
+"""Share of chi-square that an exchange of two ids may leave to be believed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +58,27 @@ def suspicious_markers(
     is more than chance and the board's tolerance do, and left out; then the rest is looked at again. With fewer than
     two markers nothing can be said.
     """
-    found: list[Suspicion] = []
     rest = list(sightings)
-    doubles = {s.marker for s in rest if sum(1 for o in rest if o.marker == s.marker) > 1}
+    exchanged = _exchanged(rest, board, camera, side_m, common_px)
+    if exchanged:
+        return exchanged
+    found: list[Suspicion] = []
     while len(rest) > 1:
         worst, index = _worst(rest, board, camera, side_m, common_px)
         if worst is None:
             break
-        if worst.marker in doubles and sum(1 for s in rest if s.marker == worst.marker) > 1:
+        if sum(1 for s in rest if s.marker == worst.marker) > 1:
             worst = replace(worst, kind="duplicate")
-        if len(rest) == 2 and worst.kind == "moved":
+        elif len(rest) == 2:
             found += [replace(worst, marker=s.marker, kind="inconsistent") for s in rest]
             break
         found.append(worst)
         rest = rest[:index] + rest[index + 1 :]
-    return _exchanged(found, list(sightings), board, camera, side_m, common_px)
+    # how well the rest fits is the measure for what stands out
+    scale = 1.0
+    if len(rest) > 1 and (fit := _fit(rest, board, camera, side_m, common_px)[0]) is not None and len(rest) > 2:
+        scale = max(1.0, fit.chi2 / max(fit.dof, 1))
+    return [s for s in found if s.chi2 > s.limit * scale]
 
 
 def _worst(
@@ -99,18 +107,22 @@ def _fit(
     sightings: list[MarkerSighting], board: Board, camera: CameraModel, side_m: float, common_px: float
 ) -> tuple[BoardFit | None, list[Float]]:
     """The best fit, and the poses of all candidates."""
-    candidates = board_pose_candidates(sightings, board, camera, side_m, common_px)
-    if not candidates:
-        return None, []
+    starts = board_pose_candidates(sightings, board, camera, side_m, common_px)
+    if not starts:
+        # contradictions can leave no pose for all together: start from each marker's own
+        singles = [board_pose_candidates([s], board, camera, side_m, common_px) for s in sightings]
+        starts = [candidate for single in singles for candidate in single]
+    poses = [candidate.camera_T_f for candidate in starts]
     corners = board_corners(sightings, board, common_px)
-    return fit_board(corners, camera, candidates[0].camera_T_f, side_m), [c.camera_T_f for c in candidates]
+    fits = [fit_board(corners, camera, pose, side_m) for pose in poses]
+    fits = [fit for fit in fits if np.isfinite(fit.chi2)]
+    return (min(fits, key=lambda fit: fit.chi2) if fits else None), poses
 
 
 def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
     """The shift against its covariance, to which the board's own tolerance is added."""
     tolerance = np.diag([board.centre_sigma_m**2] * 2 + [(board.centre_sigma_m / board.side_m) ** 2])
-    scale = max(1.0, fit.chi2 / max(fit.dof, 1))
-    covariance = fit.covariance[6:, 6:] * scale + 2 * tolerance
+    covariance = fit.covariance[6:, 6:] + 2 * tolerance
     shift, turn = fit.extra[:2], float(fit.extra[2])
     length = float(np.linalg.norm(shift))
     along = shift / length if length > 0 else np.array([1.0, 0.0])
@@ -127,33 +139,32 @@ def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
 
 
 def _exchanged(
-    found: list[Suspicion],
-    sightings: list[MarkerSighting],
-    board: Board,
-    camera: CameraModel,
-    side_m: float,
-    common_px: float,
+    sightings: list[MarkerSighting], board: Board, camera: CameraModel, side_m: float, common_px: float
 ) -> list[Suspicion]:
-    """Names pairs whose exchange mends the board."""
-    if not found or len(sightings) < 2:
-        return found
+    """The pair of ids whose exchange mends a board that does not fit, as two suspicions; else none."""
     ids = [s.marker for s in sightings]
-    if len(set(ids)) < len(ids):
-        return found
-    before, _ = _fit(sightings, board, camera, side_m, common_px)
-    limit = float(chi2_distribution.isf(_FALSE_ALARM, 2 * 4 * len(ids)))
+    before = _fit(sightings, board, camera, side_m, common_px)[0]
+    if before is None or len(ids) < 2 or len(set(ids)) < len(ids):
+        return []
+    if before.chi2 < chi2_distribution.isf(_FALSE_ALARM, before.dof):
+        return []
+    best: tuple[float, int, int] | None = None
     for a, b in combinations(range(len(ids)), 2):
-        if ids[a] not in {s.marker for s in found} and ids[b] not in {s.marker for s in found}:
-            continue
-        exchanged = [
-            replace(s, marker=ids[b] if k == a else ids[a] if k == b else s.marker) for k, s in enumerate(sightings)
-        ]
-        after, _ = _fit(exchanged, board, camera, side_m, common_px)
-        if after is not None and before is not None and after.chi2 < min(limit, 0.01 * before.chi2):
-            return [_pair(found, ids[a], ids[b]), _pair(found, ids[b], ids[a])]
-    return found
-
-
-def _pair(found: list[Suspicion], marker: int, other: int) -> Suspicion:
-    known = next((s for s in found if s.marker == marker), found[0])
-    return replace(known, marker=marker, kind="swapped", other=other)
+        other = {a: ids[b], b: ids[a]}
+        trial = [replace(s, marker=other.get(k, s.marker)) for k, s in enumerate(sightings)]
+        after = _fit(trial, board, camera, side_m, common_px)[0]
+        if after is not None and (best is None or after.chi2 < best[0]):
+            best = after.chi2, a, b
+    # an exchange moves markers by their whole distance: what it leaves is far below what was there
+    if best is None or best[0] > _MENDED * before.chi2:
+        return []
+    places = {m.id: np.array(m.centre_m) for m in board.markers}
+    pair = ids[best[1]], ids[best[2]]
+    gain = before.chi2 - best[0]
+    limit = float(chi2_distribution.isf(_FALSE_ALARM, before.dof))
+    sigma = float(np.sqrt(2.0) * board.centre_sigma_m)
+    result = []
+    for marker, other_id in (pair, pair[::-1]):
+        x, y = places[other_id] - places[marker]
+        result.append(Suspicion(marker, "swapped", (float(x), float(y)), sigma, 0.0, 0.0, gain, limit, other_id))
+    return result

@@ -20,6 +20,8 @@ Float = NDArray[np.float64]
 _WIDEST_RAD = np.deg2rad(89.0)
 """Beyond this angle from the axis an ideal pixel lies so far out that a plane image has no use for it."""
 _NEWTON_STEPS = 20
+_STEP = 8
+_GRID_PX = 5e-4
 _SOLVED = 1e-10
 """Largest remainder, in units of the focal length, of an inverse that counts as found."""
 
@@ -67,6 +69,53 @@ def undistort(camera: CameraModel, raw_px: Float, covariance_px2: Float | None =
     jacobian = scale @ np.linalg.inv(_checked(_forward(lens, ideal)[1])) @ np.linalg.inv(scale)
     covariance = jacobian @ np.asarray(covariance_px2, float).reshape(-1, 2, 2) @ jacobian.transpose(0, 2, 1)
     return result, covariance.reshape(*raw.shape[:-1], 2, 2)
+
+
+def undistorted_grid(camera: CameraModel) -> Float:
+    """The ideal pixel of every pixel of the image, shape (height, width, 2); NaN where there is none.
+
+    Where the lens model holds all over the image it is evaluated at every eighth pixel and interpolated with cubics,
+    which is exact to `_GRID_PX`.
+    """
+    columns, rows = (_nodes(n) for n in (camera.width, camera.height))
+    coarse = undistort(camera, np.stack(np.meshgrid(columns, rows), -1))[0]
+    if not np.isfinite(coarse).all():
+        return _every_pixel(camera)
+    across, down = _cubic_weights(camera.width, len(columns)), _cubic_weights(camera.height, len(rows))
+    whole = np.stack([down @ coarse[..., k] @ across.T for k in range(2)], -1)
+    # halfway between the nodes is where the interpolation is worst
+    between = np.stack(np.meshgrid(columns[1:-3] + _STEP // 2, rows[1:-3] + _STEP // 2), -1)
+    found = whole[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP][: between.shape[0], : between.shape[1]]
+    between = between[: found.shape[0], : found.shape[1]]
+    if np.abs(found - undistort(camera, between)[0]).max(initial=0.0) > _GRID_PX:
+        return _every_pixel(camera)
+    return whole
+
+
+def _every_pixel(camera: CameraModel) -> Float:
+    return undistort(
+        camera, np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), -1)
+    )[0]
+
+
+def _nodes(count: int) -> Float:
+    """Places of the interpolation's nodes: one step before the image to two after it."""
+    return _STEP * np.arange(-1.0, (count - 1) // _STEP + 3)
+
+
+def _cubic_weights(count: int, nodes: int) -> Float:
+    """Cubic Lagrange weights (count, nodes) of the pixels 0 .. count - 1."""
+    cell, t = np.divmod(np.arange(count) / _STEP, 1.0)
+    weights = np.zeros((count, nodes))
+    four = [
+        -t * (t - 1) * (t - 2) / 6,
+        (t + 1) * (t - 1) * (t - 2) / 2,
+        -(t + 1) * t * (t - 2) / 2,
+        (t + 1) * t * (t - 1) / 6,
+    ]
+    for k, value in enumerate(four):
+        weights[np.arange(count), cell.astype(int) + k] = value
+    return weights
 
 
 def distort(camera: CameraModel, ideal_px: Float) -> Float:
@@ -198,6 +247,13 @@ def _checked(jacobian: Float) -> Float:
     return np.where((np.abs(determinant) > 1e-12)[:, None, None], jacobian, np.nan)
 
 
+def _solved_by(jacobian: Float, right: Float) -> Float:
+    """2x2 systems (n, 2, 2) and (n, 2), written out: a hundred times faster than a general solver on a whole image."""
+    (a, b), (c, d) = (jacobian[:, 0, 0], jacobian[:, 0, 1]), (jacobian[:, 1, 0], jacobian[:, 1, 1])
+    over = 1.0 / (a * d - b * c)
+    return np.stack([(d * right[:, 0] - b * right[:, 1]) * over, (a * right[:, 1] - c * right[:, 0]) * over], -1)
+
+
 def _inverse(lens: _Lens, distorted: Float) -> Float:
     """Ideal points of distorted ones: a start from the radial curve, then Newton on both coordinates."""
     radius = np.hypot(distorted[:, 0], distorted[:, 1])
@@ -210,7 +266,7 @@ def _inverse(lens: _Lens, distorted: Float) -> Float:
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_NEWTON_STEPS):
             value, jacobian = _forward(lens, points)
-            step = np.linalg.solve(_checked(jacobian), (distorted - value)[..., None])[..., 0]
+            step = _solved_by(_checked(jacobian), distorted - value)
             points = points + np.nan_to_num(step)
             if not np.nanmax(np.abs(step), initial=0.0) > _SOLVED / 10:
                 break

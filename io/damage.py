@@ -33,6 +33,11 @@ class DamageReport:
     """Log time of the last message that was read."""
     messages: int = 0
 
+    @property
+    def ends_cut(self) -> bool:
+        """Whether it is said already that the end is missing."""
+        return bool(self.places) and self.places[-1].kind == "cut"
+
     def line(self) -> str | None:
         """One line; None for a sound file."""
         parts = [*_corrupt(self.places), *_ends(self.places), *self.notes]
@@ -61,7 +66,8 @@ def _ends(places: list[Damage]) -> list[str]:
     texts = []
     for place in places:
         if place.kind == "cut":
-            text = f"cut off at byte {place.offset + place.length}, the last {place.length} bytes are unusable"
+            text = f"cut off at byte {place.offset + place.length}"
+            text += f", the last {place.length} bytes are unusable" if place.length else ""
             if place.start_ns is not None and place.end_ns is not None:
                 text += f" (messages between {_span(place.start_ns, place.end_ns)})"
             texts.append(text)

@@ -69,7 +69,8 @@ class RecordStream:
                 self._data_end(length)
                 return
             if not self._plausible(opcode, length):
-                self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt")
+                if not self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt"):
+                    return
             elif opcode == CHUNK_OPCODE:
                 yield from self._chunk(offset, length)
             else:
@@ -100,7 +101,8 @@ class RecordStream:
         self._crc = self._bytes.crc
         data = self._bytes.read_up_to(_HEADER)
         if len(data) < _HEADER:
-            self._add(Damage("cut", offset, len(data), "no end mark"))
+            if not self.report.ends_cut:
+                self._add(Damage("cut", offset, len(data), "no end mark"))
             return None
         opcode, length = struct.unpack("<BQ", data)
         return opcode, length, offset
@@ -114,10 +116,9 @@ class RecordStream:
     def _plausible(self, opcode: int, length: int) -> bool:
         if opcode == 0 or length > _LIMITS.get(opcode, _OTHER_LIMIT):
             return False
-        if self._size is None or self._bytes.position + length <= self._size:
-            return True
-        # Longer than the file: cut off, unless a chunk follows somewhere, which `_resynchronise` finds out.
-        return False
+        # A chunk's header tells a wrong length from a cut. Another record that is longer than the file is cut, unless
+        # a chunk follows somewhere, which `_resynchronise` finds out.
+        return opcode == CHUNK_OPCODE or self._size is None or self._bytes.position + length <= self._size
 
     def _chunk(self, offset: int, length: int) -> Iterator[Record]:
         start = self._bytes.read_up_to(min(44, length))
@@ -170,8 +171,8 @@ class RecordStream:
         elif record is not None:
             yield record
 
-    def _resynchronise(self, offset: int, seen: bytes, reason: str) -> None:
-        """Search for the next chunk after `offset`, from where `seen` was read."""
+    def _resynchronise(self, offset: int, seen: bytes, reason: str) -> bool:
+        """Search for the next chunk after `offset`, from where `seen` was read; False: there is none."""
         self._bytes.put_back(seen[1:])
         window = b""
         while True:
@@ -184,10 +185,10 @@ class RecordStream:
                 if len(record) == 44 and self._is_chunk(record, length, base + match.end()):
                     self._bytes.put_back(window[match.start() :])
                     self._add(Damage("lost", offset, base + match.start() - offset, reason))
-                    return
+                    return True
             if not more:
                 self._add(Damage("cut", offset, self._bytes.position - offset, reason))
-                return
+                return False
             window = window[-(_HEADER + 44) :]
 
     def _is_chunk(self, record: bytes, length: int, position: int) -> bool:

@@ -11,7 +11,8 @@ import yaml
 
 from ..estimator.executor import Executor, Outcome
 from ..factors.errors import SurecutError
-from .campaign_run import Level, Row, RunOrder, failed_row, run
+from .campaign_row import Row, failed_row
+from .campaign_run import Level, RunOrder, run
 from .measurement_level_scenario import load_scenario
 from .scenario import load_scenarios
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .campaign_run import Row, quantities_of
+from .campaign_row import Row, quantities_of
 from .campaign_table import CampaignTable
 from .evaluate_summary import Summary, clopper_pearson
 

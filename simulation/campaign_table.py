@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .campaign import write_whole
-from .campaign_run import Row, quantities_of
+from .campaign_row import Row, quantities_of
 from .evaluate_summary import Coverage, Summary, clopper_pearson, summarise
 
 

@@ -11,7 +11,7 @@ from .scenario import Scenario, ScenarioError, load_scenarios, override, scenari
 
 
 def command(
-    out: Annotated[Path, typer.Argument(help="The log to write (.mcap).")],
+    out: Annotated[Path | None, typer.Argument(help="The log to write (.mcap).", show_default=False)] = None,
     scenario: Annotated[str, typer.Option(help="A scenario file, or a name that --list shows.")] = "demo",
     run: Annotated[int, typer.Option(help="Which run of a scenario with several, from 1.", min=1)] = 1,
     seed: Annotated[int, typer.Option(help="Draws faults of the rig, cell, motion and noise.", min=0)] = 1,
@@ -30,6 +30,8 @@ def command(
             runs = load_scenarios(name)
             typer.echo(f"{name:12} {len(runs)} run{'s' * (len(runs) > 1)}: {runs[0].description}")
         return
+    if out is None:
+        raise typer.BadParameter("name the log to write", param_hint="out")
     changes = {
         "duration_s": duration,
         "place": place,

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -47,7 +48,7 @@ def evaluate(result: Result, truth: Truth) -> tuple[Quantity, ...]:
         *_points(result, truth.points_b_m),
         *_poses(result, truth),
         *_trajectory(result, truth),
-        *_calibration(result, calibration_truth(truth)),
+        *_calibration(result, calibration_truth(truth) | extrinsics_truth(result, truth)),
         *_pipe_radii(result, truth),
     )
 
@@ -100,6 +101,25 @@ def calibration_truth(truth: Truth) -> dict[str, float]:
     for board in rig.boards.values():
         values |= {f"{board.id}.side": board.side_m, f"{board.id}.print_scale": board.print_scale}
     return {name: float(value) for name, value in values.items()}
+
+
+def extrinsics_truth(result: Result, truth: Truth) -> dict[str, float]:
+    """The right camera's and the Kinect colour camera's pose, in the coordinates of `Result.calibration`.
+
+    These are the tangent coordinates of the pose about its prior, plus the prior's own translation. Priors that turn
+    the camera are left out: their translation would have to be known in two frames.
+    """
+    prior = {state.name: state.prior for state in result.calibration}
+    found: dict[str, float] = {}
+    for name, pose in (("m_left_T_m_right", truth.rig.m_left_T_m_right), ("b_T_rgb", truth.rig.b_T_rgb)):
+        parts = [f"{name}.{part}" for part in ("tx", "ty", "tz", "rx", "ry", "rz")]
+        if not all(part in prior for part in parts):
+            continue
+        mean = gtsam.Pose3(gtsam.Rot3(), np.array([prior[part] for part in parts[:3]]))
+        moved = gtsam.Pose3.Logmap(mean.between(gtsam.Pose3(pose)))
+        values = [*(prior[part] + moved[3 + i] for i, part in enumerate(parts[:3])), *moved[:3]]
+        found |= dict(zip(parts, map(float, values), strict=True))
+    return found
 
 
 def _points(result: Result, true_m: dict[str, Float]) -> list[Quantity]:

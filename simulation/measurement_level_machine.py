@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..estimator.baseline import ClickedPoint
+from ..estimator.pipes import EDGE_FLOOR_PX
 from ..factors.measurements import CloudFrame, OutlineSighting, Pick
 from ..factors.outline import outline_lines
 from .measurement_level_scene import cast, occluded
@@ -103,7 +104,9 @@ def _stereo_click(world: World, pick: Pick) -> ClickedPoint:
 
 def _pick(world: World, stamp_ns: int, point_id: str, role: str, exact_px: Float) -> Pick:
     settings, rng = world.scenario.picks, world.rng
-    px = exact_px + rng.normal(0.0, settings.sigma_px * world.scenario.noise_factors.picks, 2)
+    # The model adds a floor to every click and every edge, and a campaign draws what the models say.
+    sigma_px = np.hypot(settings.sigma_px, world.rig.noise.pick_floor_px)
+    px = exact_px + rng.normal(0.0, sigma_px * world.scenario.noise_factors.picks, 2)
     if "picks" in world.scenario.outliers.families:
         px = spoil(px[None], world.scenario.outliers, rng)[0]
     covariance = settings.sigma_px**2 * np.eye(2)
@@ -123,7 +126,8 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
     noisy, feet, extents = np.empty((2, 3)), np.empty((2, 2)), np.empty((2, 2, 2))
     for i, line in enumerate(lines):
         feet[i] = pick_px - (line @ np.r_[pick_px, 1.0]) * line[:2]
-        shift, turn = rng.normal(0.0, sigmas * world.scenario.noise_factors.outlines)
+        spread = np.array([np.hypot(sigmas[0], EDGE_FLOOR_PX), sigmas[1]])
+        shift, turn = rng.normal(0.0, spread * world.scenario.noise_factors.outlines)
         if "outlines" in world.scenario.outliers.families and rng.random() < world.scenario.outliers.share:
             shift += rng.uniform(-1.0, 1.0) * world.scenario.outliers.size_px
         noisy[i] = _moved_line(line, feet[i], shift, turn)

@@ -7,6 +7,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import cv2
 import yaml
 
 from ..factors.rig import dump_rig
@@ -20,7 +21,8 @@ from .session import Session, prepare, stamp_ns
 from .studio import Shot, jobs_of, set_up
 
 Progress = Callable[[float], None]
-IMAGE, INFO, POSE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseStamped"
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+INFO, POSE = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseStamped"
 _TOPICS = {"m_left": "/m/left", "m_right": "/m/right", "b_rgb": "/b/rgb", "b_depth": "/b/depth"}
 
 
@@ -106,7 +108,12 @@ def _write(sink: McapSink, shot: Shot, rig: RigPair, scenario: Scenario) -> None
     for name, encoding, pixels in shot.images:
         info = build.camera_info(stamp, name, rig.cameras[name])
         sink.write(f"{_TOPICS[name]}/camera_info", INFO, info, stamp)
-        sink.write(f"{_TOPICS[name]}/image_raw", IMAGE, _image(stamp, name, encoding, pixels), stamp)
+        if scenario.jpeg_quality is not None and encoding != "depth":
+            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, scenario.jpeg_quality])[1].tobytes()
+            image = build.compressed_image(stamp, name, data, "jpeg")
+            sink.write(f"{_TOPICS[name]}/image_raw", COMPRESSED, image, stamp)
+        else:
+            sink.write(f"{_TOPICS[name]}/image_raw", IMAGE, _image(stamp, name, encoding, pixels), stamp)
     for click in shot.clicks:
         sigma = scenario.picks.sigma_px
         pick = build.pixel_pick(stamp, click.camera, click.point_id, click.role, click.uv_px, sigma)

@@ -175,6 +175,8 @@ class Scenario(Section):
     bias: Bias = Bias()
     timeline: Timeline = Timeline()
     picks: PickOptions = PickOptions()
+    jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = None
+    """Images as `CompressedImage` of that quality; None: raw."""
     detail: Annotated[float, Field(gt=0, le=4)] = 1.0
     """Fineness of the textures (the page is always fine); lower starts faster, higher suits large images."""
 

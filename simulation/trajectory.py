@@ -56,10 +56,10 @@ def plan(scenario: Scenario, cell: Cell, w_T_c: Float, rng: np.random.Generator)
     angles = np.unwrap([view_angles(stop.target - stop.place) for stop in stops], axis=0)
     knots = np.concatenate([np.array([stop.place for stop in stops]), angles], axis=1)
     grid = np.arange(-0.5, duration + 0.5, 1 / _GRID_HZ)
-    warped = _warped(grid, scenario.timeline.still, duration)
+    softness = 0.22 if scenario.motion == "smooth" else 0.08
+    warped = _warped(grid, scenario.timeline.still, duration, 4.5 * softness)
     values = PchipInterpolator(times, knots, axis=0)(np.clip(warped[0], times[0], times[-1]))
     values = np.concatenate([values, 0.03 * np.sin(warped[0][:, None] * 0.6 + rng.uniform(0, 6))], axis=1)
-    softness = 0.22 if scenario.motion == "smooth" else 0.08
     values = gaussian_filter1d(values, softness * _GRID_HZ, axis=0, mode="nearest")
     calm = gaussian_filter1d(warped[1], 0.1 * _GRID_HZ)[:, None]
     values += calm * _tremor(grid, 1.0 if scenario.motion == "smooth" else 1.8, rng)
@@ -127,11 +127,16 @@ def _sharpened(stops: list[_Stop], dwells: list[tuple[float, float]], rng: np.ra
     return sharp
 
 
-def _warped(grid: Float, still: tuple[tuple[float, float], ...], duration: float) -> tuple[Float, Float]:
-    """Time along the plan for each time of the grid, and 1 where the hand holds the camera, 0 where it is put down."""
+def _warped(
+    grid: Float, still: tuple[tuple[float, float], ...], duration: float, margin_s: float
+) -> tuple[Float, Float]:
+    """Time along the plan for each time of the grid, and 1 where the hand holds the camera, 0 where it is put down.
+
+    The plan pauses `margin_s` longer on both sides, so that smoothing leaves the interval itself at rest.
+    """
     pace = np.ones_like(grid)
     for start, end in still:
-        pace[(grid >= start - 0.3) & (grid <= end + 0.3)] = 0
+        pace[(grid >= start - margin_s) & (grid <= end + margin_s)] = 0
     free = np.maximum(pace * (grid >= 0) * (grid <= duration), 0)
     progress = np.cumsum(free)
     return progress / max(progress[-1], 1) * duration, pace

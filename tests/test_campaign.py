@@ -12,7 +12,8 @@ from surecut.factors.errors import SurecutError
 from surecut.simulation import campaign as campaign_module
 from surecut.simulation.campaign import Campaign, failures, open_campaign, run_campaign
 from surecut.simulation.campaign_report import report_html
-from surecut.simulation.campaign_run import failed_row, quantities_of, run_measurements
+from surecut.simulation.campaign_row import failed_row, quantities_of
+from surecut.simulation.campaign_run import run_measurements
 from surecut.simulation.campaign_table import coverage_at, tabulate, write_tables
 from surecut.simulation.campaign_validation import update_validation
 from surecut.simulation.evaluate import point_quantity, scalar_quantity
@@ -21,7 +22,7 @@ from surecut.simulation.measurement_level_scenario import Scenario
 SHORT = Scenario.model_validate(
     {
         "name": "short",
-        "motion": {"duration_s": 6.0, "keyframe_rate_hz": 2.0},
+        "motion": {"duration_s": 12.0, "keyframe_rate_hz": 2.0},
         "tracks": {"per_frame": 40},
         "clouds": {"frames": 0},
     }

@@ -70,8 +70,8 @@ def test_needles_and_pancakes_against_a_fine_grid(ratio):
     covariance = turn @ np.diag([1.0, ratio**-2, 0.25]) @ turn.T
     exact = cylinder_probability(covariance, np.eye(3)[0], 0.8, 1.1)
     # In principal axes: for each point of (u, w) the narrow direction is a closed interval.
-    u, w = np.meshgrid((np.arange(20_000) + 0.5) * 6e-4 - 6, (np.arange(400) + 0.5) * 0.015 - 3, indexing="ij")
-    weight = np.exp(-0.5 * u**2 - 2 * w**2) / np.pi * (6e-4 * 0.015)
+    u, w = np.meshgrid((np.arange(12_000) + 0.5) * 1e-3 - 6, (np.arange(240) + 0.5) * 0.025 - 3, indexing="ij")
+    weight = np.exp(-0.5 * u**2 - 2 * w**2) / np.pi * (1e-3 * 0.025)
     half = np.sqrt(np.maximum(1.21 - w**2, 0))
     low = np.maximum((c * u - 0.8) / s, (-half - s * u) / c)
     high = np.minimum((c * u + 0.8) / s, (half - s * u) / c)

@@ -2,7 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from report_results import AXIS, SECOND, make_consistency, make_point, make_result, make_rig
+from report_results import AXIS, SECOND, make_consistency, make_point, make_pose, make_result, make_rig
 from scipy.special import ndtr, ndtri
 from scipy.stats import chi
 
@@ -156,6 +156,14 @@ def test_never_go(changes, words):
     assert made.verdict == "MEASURE MORE"
     assert any(words in blocker for blocker in made.blockers)
     assert made.blockers[0] in made.headline
+
+
+def test_the_machine_has_moved_on():
+    poses = tuple(make_pose(name, "o", (0, 0, 0), 0) for name in ("b0", "b9", "b10", "f0"))
+    assert decision(point=round_point(0.002, frame="b10"), poses=poses).verdict == "GO"
+    made = decision(point=round_point(0.002, frame="b9"), poses=poses)
+    assert made.verdict == "MEASURE MORE"
+    assert "it now stands at b10" in made.headline
 
 
 def test_no_pick_and_no_plan():

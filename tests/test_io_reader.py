@@ -1,5 +1,6 @@
 """Logs that are read: the same from a file and from a pipe, sound or damaged, ours and others'."""
 
+import contextlib
 import io
 import json
 import os
@@ -49,12 +50,9 @@ def from_pipe(path: Path, topics=None) -> LogReader:
     end, start = os.pipe()
 
     def feed():
-        with os.fdopen(start, "wb") as sink, path.open("rb") as source:
-            try:
-                while data := source.read(3000):
-                    sink.write(data)
-            except BrokenPipeError:
-                pass
+        with contextlib.suppress(BrokenPipeError), os.fdopen(start, "wb") as sink, path.open("rb") as source:
+            while data := source.read(3000):
+                sink.write(data)
 
     threading.Thread(target=feed, daemon=True).start()
     STREAMS.append(os.fdopen(end, "rb"))
@@ -199,9 +197,20 @@ def test_a_log_cut_anywhere_gives_what_is_whole(open_log: Open, tmp_path: Path, 
         longest = max(longest, len(got))
         if len(got) < len(expected):
             assert len(warnings) == 1, cut
+            assert warnings[0].count("cut off") == 1
             assert f"cut off at byte {cut}" in warnings[0]
             assert f"{len(got)} messages read" in warnings[0]
     assert longest > 0.8 * len(expected)
+
+
+def test_a_cut_chunk_tells_which_times_are_lost(open_log: Open, tmp_path: Path):
+    path = tmp_path / "log.mcap"
+    logmaker.write_log(path, 20, chunk_size=1 << 22)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with open_log(path) as reader:
+        assert counts(reader) == {}
+        assert "unusable (messages between 1000.001 s and 1000.951 s); 0 messages read" in reader.warnings[0]
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])

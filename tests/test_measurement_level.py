@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from surecut.estimator.pipes import EDGE_FLOOR_PX
 from surecut.factors.cloud import corrected
 from surecut.factors.errors import RigError
 from surecut.factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
@@ -139,14 +140,16 @@ def test_picks_and_outlines(runs):
         for pick in of(run, Pick):
             point_o = transform(truth.o_T_b, truth.points_b_m[pick.point_id])
             exact = project(camera, m_T_o(run, pick.stamp_ns), point_o[None])[0]
-            clicks.append(whitened((pick.px - exact)[None], pick.covariance_px2[None]))
+            model = pick.covariance_px2 + run.rig.noise.pick_floor_px**2 * np.eye(2)
+            clicks.append(whitened((pick.px - exact)[None], model[None]))
         for outline in of(run, OutlineSighting):
             c_T_b = m_T_o(run, outline.stamp_ns) @ truth.o_T_b
             a = transform(c_T_b, truth.pipe.point_b_m + 0.8 * truth.pipe.axis_b)
             b = transform(c_T_b, truth.pipe.point_b_m + 1.3 * truth.pipe.axis_b)
             for line, foot, covariance in zip(outline.lines, outline.foot_px, outline.covariance, strict=True):
                 residual, _ = outline_residual(line, camera.K, a, b, truth.pipe.radius_m)
-                noise = outline_noise(line, foot, covariance, camera.K, a, b)
+                model = covariance + np.diag([EDGE_FLOOR_PX**2, 0.0])
+                noise = outline_noise(line, foot, model, camera.K, a, b)
                 edges.append(whitened(residual[None], noise[None]))
     assert_normal(np.concatenate(clicks))
     assert_normal(np.concatenate(edges))
@@ -164,7 +167,7 @@ def test_wrong_noise_has_the_asked_factor(family):
             for stamp in {pick.stamp_ns for pick in of(run, Pick)}:
                 px = [p.px for p in of(run, Pick) if (p.point_id, p.stamp_ns) == (point_id, stamp)]
                 values.append((px - np.mean(px, axis=0)).ravel() * np.sqrt(40 / 39))
-        stated = scenario.picks.sigma_px
+        stated = np.hypot(scenario.picks.sigma_px, run.rig.noise.pick_floor_px)
     else:
         for sighting in of(run, MarkerSighting):
             page = run.truth.rig.boards["f0"]

@@ -15,12 +15,12 @@ from surecut.estimator.report.axes import K3, half_axes, triad
 from surecut.estimator.report.blocks import Table
 from surecut.estimator.report.compare import Run, build_comparison, mahalanobis2
 from surecut.estimator.report.content import build_document
-from surecut.estimator.report.essentials import budget_closure, budget_rows
+from surecut.estimator.report.essentials import budget_closure, budget_rows, family_shares
 from surecut.estimator.report.glossary import TERMS
 from surecut.estimator.report.html import render_html
 from surecut.estimator.report.machine import render_json
 from surecut.estimator.report.text import duration, fixed, mm, mm_with, significant, utc, with_sigma
-from surecut.estimator.result import Advice, PickView
+from surecut.estimator.result import Advice, FamilyConsistency, PickView
 from surecut.estimator.validated_range import ValidatedRange
 from surecut.factors.rig import Cut
 
@@ -131,7 +131,7 @@ def test_nothing_from_outside_and_no_script():
 
 def test_every_drawing_is_well_formed_and_finite():
     drawings = re.findall(r"<svg .*?</svg>", page(), re.DOTALL)
-    assert len(drawings) == 11
+    assert len(drawings) == 12
     for drawing in drawings:
         root = ET.fromstring(drawing)
         assert root.find("{http://www.w3.org/2000/svg}title").text
@@ -243,8 +243,29 @@ def test_singular_covariance_is_drawn_or_told_but_never_go():
 def test_failed_consistency_leads():
     html = page(make_result(consistency=make_consistency(False)))
     assert "the data contradict the model" in html
-    assert "OUTSIDE" in html
+    assert "ABOVE" in html
     assert ("verdict", "P1", "MEASURE MORE") in outline(html).items
+
+
+def test_families_that_cannot_be_tested_or_are_better_than_claimed():
+    consistency = make_consistency()
+    mount = FamilyConsistency("mount", 0.0, 0.0, 0.0, float("inf"), 1, 0)
+    calm = FamilyConsistency("calm", 10.0, 100.0, 0.5, 1.5, 100, 0)
+    families = (*consistency.by_family, mount, calm)
+    html = page(make_result(consistency=dataclasses.replace(consistency, by_family=families)))
+    assert '<td>mount</td><td class="number">0.0</td><td class="number">0.0</td><td class="number">none</td>' in html
+    assert "stated with caution: calm." in html
+    assert "nan" not in "".join(re.findall(r"<svg .*?</svg>", html, re.DOTALL))
+
+
+def test_sources_are_drawn_by_family_and_listed_one_by_one():
+    part = make_point().covariance_m2 / 4
+    budget = {"picks: P1": part, "picks: P2": part, "mount": 2 * part * (1 - 1e-5), "gauge": 2e-5 * part}
+    point = dataclasses.replace(make_point(), budget=budget)
+    assert family_shares(point)["picks"] == pytest.approx(np.trace(point.covariance_m2) / 2)
+    html = page(make_result(points=(point,)))
+    assert "picks: P1</td>" in html
+    assert "below 0.1 %" in html
 
 
 def test_several_cuts_get_a_summary_in_the_plan_s_order():

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from stereo_scene import HEIGHT, WIDTH, Room, camera, expose, left_T_right, pose
+
 from surecut.frontends.stereo.dense import dense_points
 
 ROI = (100, 60, 160, 120)

@@ -6,6 +6,7 @@ import pytest
 from stereo_scene import BASELINE, HEIGHT, WIDTH, K, Room, camera, expose, left_T_right, pose, texture
 
 from surecut.frontends.stereo.frontend import StereoFrontEnd
+from surecut.frontends.undistort import undistort
 
 STEP_NS = 50_000_000
 
@@ -198,6 +199,26 @@ def test_a_rig_that_is_off_keeps_its_matches(rendered):
     assert np.abs(np.median(vertical - expected)) < 0.03
     assert np.sqrt(np.median(last.right_covariance_px2[right, 1, 1])) < 0.12
     assert errors(frames, truth)[:, 0].max() < 0.02
+
+
+def test_a_distorted_lens_delivers_ideal_pixels(rendered):
+    """The same walk through a lens with 6 % of barrel distortion in the corners."""
+    truth, pairs = rendered
+    lens = (-0.25, 0.06, 0.001, -0.001, 0.0)
+    u, v = np.meshgrid(np.arange(float(WIDTH)), np.arange(float(HEIGHT)))
+    ideal = undistort(camera(distortion=lens), np.stack((u.ravel(), v.ravel()), axis=1))[0].astype(np.float32)
+    maps = ideal[:, 0].reshape(HEIGHT, WIDTH), ideal[:, 1].reshape(HEIGHT, WIDTH)
+    bent = [
+        (*(cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT) for image in pair[:2]), None)
+        for pair in pairs[:24]
+    ]
+    front = StereoFrontEnd(camera(distortion=lens), camera("m_right", lens), left_T_right())
+    frames = run(bent, front=front)
+    rows, outliers = residuals(frames, truth[:24])
+    assert outliers < 0.02
+    assert np.abs(np.mean(rows[:, :2], axis=0)).max() < 0.02
+    assert np.sqrt((rows[:, :2] ** 2).mean()) < 0.1
+    assert errors(frames, truth[:24])[:, 0].max() < 0.01
 
 
 def test_a_moving_arm_does_not_carry_the_camera_away():

@@ -11,12 +11,11 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from ...factors.errors import RigError
-from ...factors.rig import Rig, load_rig
 from ...io.messages import PointsBody
 from ...io.reader import LogReader
 from ..baseline import ChainPoint
 from ..compare import chain_of_messages
+from ..optimise import rig_of
 from ..output_files import write_text
 from ..pipeline import wanted_topics
 from ..result import Result
@@ -35,7 +34,8 @@ def command(
 ) -> None:
     """Run the paper's chain of single measurements on a log, for every click."""
     console = Console()
-    effective = rig_of(log, rig)
+    with LogReader(log, ()) as reader:
+        effective = rig_of(reader, rig)
     with (
         LogReader(log, wanted_topics(effective)) as reader,
         Progress(SpinnerColumn(), TextColumn("reading"), TimeElapsedColumn(), console=console, transient=True) as bar,
@@ -47,21 +47,6 @@ def command(
     console.print(table_of(points, estimate, truth))
     if json_file is not None:
         write_text(json_file, json.dumps(as_json(points, estimate, truth), indent=1) + "\n")
-
-
-def rig_of(log: str, rig: Path | None) -> Rig:
-    """The given rig, or the one that the log carries.
-
-    Raises:
-        RigError: there is none.
-    """
-    if rig is not None:
-        return load_rig(rig)
-    with LogReader(log, ()) as reader:
-        text = reader.attachment("rig.yaml")
-    if text is None:
-        raise RigError(f"{log}: carries no rig.yaml; give the rig file with --rig")
-    return load_rig(text, f"{log}: attachment rig.yaml")
 
 
 def true_points(log: str) -> dict[str, Float]:

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi
+from scipy.special import chdtri
 
 from ..result import PointEstimate
 
 Float = NDArray[np.float64]
 
-K3 = float(chi.ppf(0.95, 3))
+K3 = float(np.sqrt(chdtri(3, 0.05)))
 """Coverage factor of a 3-D region, 2.80: what 1.96 is for a single number."""
 
 

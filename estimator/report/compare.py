@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ...factors.rig import Rig
 from ..decision import Decision, decide, percent
@@ -93,7 +93,7 @@ def _pair(a: PointEstimate, b: PointEstimate) -> Iterator[Block]:
     covariance = directions.turned(a.covariance_m2 + b.covariance_m2)
     sigma = np.sqrt(np.diag(covariance))
     distance2 = mahalanobis2(a, b)
-    chance = float(chi2.sf(distance2, 3))
+    chance = float(chdtrc(3, distance2))
     yield Table(
         caption=(
             f"{a.id}: B less A with one standard uncertainty. Together {significant(float(np.sqrt(distance2)))} σ in "

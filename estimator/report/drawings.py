@@ -181,15 +181,19 @@ def budget_bars(shares: list[tuple[str, float]], title: str) -> Figure:
         width = max(abs(share) / largest * room, 0.4)
         fill = 0.35 if share >= 0 else 1.0
         strokes += [
-            Label(left - 6, y + 9.8, name, 8.5, "end"),
+            Label(left - 6, y + 9.8, shortened(name), 8.5, "end"),
             rectangle(left, y + 2.5, width, row - 5, pen=0.6, grey=0.2, fill=fill),
             Label(left + width + 5, y + 9.8, f"{significant(share * 100)} %", 8.5),
         ]
     return Figure(WIDTH, row * len(shares) + 2, tuple(strokes), title)
 
 
-def acceptance_intervals(families: tuple[FamilyConsistency, ...]) -> Figure:
-    """Chi-square per degree of freedom of each family against its limits, on a logarithmic scale about 1."""
+def acceptance_intervals(all_families: tuple[FamilyConsistency, ...]) -> Figure:
+    """Chi-square per degree of freedom of each family against its limits, on a logarithmic scale about 1.
+
+    A family without a degree of freedom of its own can neither agree nor disagree and is left out.
+    """
+    families = [family for family in all_families if np.isfinite(_ratio(family))]
     row, left = 16.0, 150.0
     room = WIDTH - left - 70
     values = [_ratio(family) for family in families]
@@ -208,19 +212,42 @@ def acceptance_intervals(families: tuple[FamilyConsistency, ...]) -> Figure:
     ]
     for index, (family, value) in enumerate(zip(families, values, strict=True)):
         y = index * row + row / 2
-        inside = family.lower <= value <= family.upper
+        word = "ABOVE" if value > family.upper else "below" if value < family.lower else "within"
         lower, upper = at(family.lower), at(family.upper)
         strokes += [
-            Label(left - 6, y + 3, family.family, 8.5, "end"),
+            Label(left - 6, y + 3, shortened(family.family), 8.5, "end"),
             rectangle(lower, y - 3.5, max(upper - lower, 0.6), 7, pen=0.6, grey=0.4, fill=LIGHT),
-            Path(_diamond(at(value), y, 4.0), closed=True, fill=0.0 if inside else 1.0, pen=1.2),
-            Label(WIDTH, y + 3, "within" if inside else "OUTSIDE", 8.5, "end", bold=not inside),
+            Path(_diamond(at(value), y, 4.0), closed=True, fill=1.0 if word == "ABOVE" else 0.0, pen=1.2),
+            Label(WIDTH, y + 3, word, 8.5, "end", bold=word == "ABOVE"),
         ]
     return Figure(WIDTH, height + 12, tuple(strokes), "Chi-square per degree of freedom against its limits")
 
 
+def residual_tenths(families: list[FamilyConsistency]) -> Figure:
+    """One small histogram for each family: how its residuals fill the tenths of their expected distribution."""
+    columns, width, height, row = 4, WIDTH / 4 - 12, 44.0, 70.0
+    strokes: list[Stroke] = []
+    for index, family in enumerate(families):
+        x, y = (index % columns) * WIDTH / columns, (index // columns) * row + 12
+        total, step = max(sum(family.tenths), 1), width / len(family.tenths)
+        even = height / 2.5
+        strokes.append(Label(x, y - 3, shortened(family.family, 26), 8))
+        for tenth, count in enumerate(family.tenths):
+            high = min(count / total * len(family.tenths) * even, height)
+            strokes.append(rectangle(x + tenth * step, y + height - high, step, high, pen=0.4, grey=0.2, fill=0.72))
+        strokes.append(line(x, y + height - even, x + width, y + height - even, pen=0.8, dash=(3, 2)))
+        strokes.append(line(x, y + height, x + width, y + height, pen=0.6))
+    rows = -(-len(families) // columns)
+    return Figure(WIDTH, rows * row - 10, tuple(strokes), "Residuals against their expected distribution")
+
+
+def shortened(name: str, letters: int = 36) -> str:
+    """A label that fits beside a bar."""
+    return name if len(name) <= letters else f"{name[: letters - 1]}…"
+
+
 def _ratio(family: FamilyConsistency) -> float:
-    return family.chi2 / family.dof if family.dof > 0 else float("nan")
+    return family.chi2 / family.dof if family.dof > 1e-6 else float("nan")
 
 
 def _diamond(x: float, y: float, radius: float) -> Float:
@@ -249,7 +276,7 @@ def sigma_bars(rows: list[tuple[str, float]], title: str) -> Figure:
         shown = value if np.isfinite(value) else 0.0
         start, width = (zero, shown * scale) if shown >= 0 else (zero + shown * scale, -shown * scale)
         strokes += [
-            Label(left - 6, y + 9.8, name, 8.5, "end"),
+            Label(left - 6, y + 9.8, shortened(name), 8.5, "end"),
             rectangle(start, y + 3, max(width, 0.5), row - 6, pen=0.6, grey=0.2, fill=0.35 if abs(shown) <= 3 else 0.0),
             Label(WIDTH, y + 9.8, f"{significant(value)} σ", 8.5, "end", bold=abs(shown) > 3),
         ]

@@ -17,7 +17,7 @@ Float = NDArray[np.float64]
 
 NO_VERDICT = "NO VERDICT"
 ADVICE_SHOWN = 5
-BARS_SHOWN = 9
+BARS_SHOWN = 8
 VIEWS_SHOWN = 4
 
 
@@ -156,6 +156,15 @@ def budget_rows(point: PointEstimate) -> list[tuple[str, Float]]:
     return sorted(point.budget.items(), key=lambda item: (-float(np.trace(item[1])), item[0]))
 
 
+def family_shares(point: PointEstimate) -> dict[str, float]:
+    """Variance [m²], summed over the three directions, by family: what stands before the colon of a source's name."""
+    shares: dict[str, float] = {}
+    for name, part in budget_rows(point):
+        family = name.partition(":")[0]
+        shares[family] = shares.get(family, 0.0) + float(np.trace(part))
+    return shares
+
+
 def budget_closure(point: PointEstimate) -> float:
     """Largest deviation of the budget's sum from the covariance, relative to the covariance's largest entry."""
     total = np.sum([part for _, part in budget_rows(point)], axis=0) if point.budget else np.zeros((3, 3))
@@ -167,11 +176,11 @@ def _budget_chart(point: PointEstimate) -> Iterator[Block]:
         yield Paragraph("The result holds no uncertainty budget for this point.")
         return
     total = float(np.trace(point.covariance_m2))
-    rows = budget_rows(point)
-    shares = [(name, float(np.trace(part)) / total) for name, part in rows[:BARS_SHOWN]]
-    rest = sum(float(np.trace(part)) for _, part in rows[BARS_SHOWN:]) / total
-    if len(rows) > BARS_SHOWN:
-        shares.append((f"{len(rows) - BARS_SHOWN} more", rest))
+    families = sorted(family_shares(point).items(), key=lambda item: (-item[1], item[0]))
+    shares = [(name, trace / total) for name, trace in families[:BARS_SHOWN]]
+    if len(families) > BARS_SHOWN:
+        rest = sum(trace for _, trace in families[BARS_SHOWN:]) / total
+        shares.append((f"{len(families) - BARS_SHOWN} more", rest))
     bars = budget_bars(shares, f"Uncertainty budget of {point.id}")
     yield Drawing(bars, "Share of each source in the total variance of the measured point.")
     closure = budget_closure(point)
@@ -185,7 +194,7 @@ def _budget_table(point: PointEstimate, directions: Triad) -> Iterator[Block]:
     total = float(np.trace(point.covariance_m2))
     places = decimals(float(np.sqrt(total)) * 1e3) + 1
     table = [
-        (name, *(_root(v, places) for v in np.diag(directions.turned(part))), f"{np.trace(part) / total * 100:.1f} %")
+        (name, *(_root(v, places) for v in np.diag(directions.turned(part))), _share(float(np.trace(part)) / total))
         for name, part in budget_rows(point)
     ]
     sums = np.diag(directions.turned(point.covariance_m2))
@@ -200,6 +209,10 @@ def _budget_table(point: PointEstimate, directions: Triad) -> Iterator[Block]:
         total=2,
         widths=(0.4, 0.14, 0.14, 0.14, 0.18),
     )
+
+
+def _share(share: float) -> str:
+    return f"{share * 100:.1f} %" if abs(share) >= 5e-4 or share == 0 else "below 0.1 %"
 
 
 def _root(variance: float, places: int) -> str:

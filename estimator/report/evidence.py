@@ -5,13 +5,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..result import CalibrationEstimate, DistanceEstimate, Result
+from ..result import CalibrationEstimate, DistanceEstimate, FamilyConsistency, Result
 from ..validated_range import QUANTITIES, ValidatedRange, quantities
 from .blocks import Block, Drawing, Heading, Paragraph, Table
-from .drawings import acceptance_intervals, sigma_bars
+from .drawings import acceptance_intervals, residual_tenths, sigma_bars
 from .text import duration, mm_with, significant, utc, with_sigma
 
 REASONS_SHOWN = 40
+MOVED_SHOWN = 8
+TENTHS_LEAST = 40
+"""Residuals of a family from which on a histogram says something."""
+DOF_LEAST = 1e-6
+"""A family with fewer degrees of freedom has nothing to be tested with."""
 
 
 def evidence_pages(result: Result, validated: ValidatedRange | None) -> Iterator[Block]:
@@ -32,13 +37,15 @@ def _consistency(result: Result) -> Iterator[Block]:
     consistency = result.consistency
     yield Heading("Does the model agree with its own data?")
     if consistency.passed:
-        yield Paragraph("Yes. Every family of measurements scatters as much as its stated uncertainty says.")
+        low = [f.family for f in consistency.by_family if f.dof > DOF_LEAST and f.chi2 / f.dof < f.lower]
+        more = f" Less than stated, so stated with caution: {', '.join(low)}." if low else ""
+        yield Paragraph(f"Yes. No family of measurements scatters more than its stated uncertainty allows.{more}")
     else:
         yield Paragraph("NO: " + "; ".join(consistency.reasons or ("the consistency check failed",)) + ".")
     if not consistency.by_family:
         return
     rows = tuple(
-        (f.family, f"{f.chi2:.1f}", f"{f.dof:.1f}", _ratio(f.chi2, f.dof), f"{f.lower:.3g} to {f.upper:.3g}",
+        (f.family, f"{f.chi2:.1f}", f"{f.dof:.1f}", _ratio(f.chi2, f.dof), _limits(f),
          str(f.residuals), str(f.downweighted))
         for f in consistency.by_family
     )  # fmt: skip
@@ -55,10 +62,21 @@ def _consistency(result: Result) -> Iterator[Block]:
         acceptance_intervals(consistency.by_family),
         "Ratio (diamond) and its limits (bar), logarithmic. Above: noisier than claimed. Below: better than claimed.",
     )
+    drawn = [f for f in consistency.by_family if sum(f.tenths) >= TENTHS_LEAST]
+    if drawn:
+        yield Drawing(
+            residual_tenths(drawn),
+            "Residuals by tenths of the distribution that they ought to have, small ones left. The dashed line is the "
+            "expected count; a pile at the right end means outliers or too small an uncertainty.",
+        )
+
+
+def _limits(family: FamilyConsistency) -> str:
+    return f"{family.lower:.3g} to {family.upper:.3g}" if np.isfinite(family.upper) else ""
 
 
 def _ratio(chi2: float, dof: float) -> str:
-    return significant(chi2 / dof, 3) if dof > 0 else "none"
+    return significant(chi2 / dof, 3) if dof > DOF_LEAST else "none"
 
 
 def _paths(result: Result) -> Iterator[Block]:
@@ -165,9 +183,9 @@ def _calibration(result: Result) -> Iterator[Block]:
         widths=(0.4, 0.22, 0.22, 0.16),
     )
     if moved:
-        yield Drawing(
-            sigma_bars(moved, "Calibration against its prior"), "How far each state has moved from its prior."
-        )
+        furthest = sorted(moved, key=lambda row: (-abs(row[1]), row[0]))[:MOVED_SHOWN]
+        bars = sigma_bars(furthest, "Calibration against its prior")
+        yield Drawing(bars, "The states that moved furthest from their priors.")
 
 
 def _moved(state: CalibrationEstimate) -> float:

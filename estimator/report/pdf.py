@@ -31,6 +31,8 @@ from .pdf_figure import FONT, FigureFlowable
 
 MARGIN = 16 * mm
 FRAME = A4[0] - 2 * MARGIN
+ROWS_TOGETHER = 16
+"""Tables up to this length are not torn apart."""
 FACES = {"": "STIXGeneral.ttf", "-Bold": "STIXGeneralBol.ttf", "-Italic": "STIXGeneralItalic.ttf"}
 """The fonts that come with matplotlib under the SIL Open Font License."""
 
@@ -71,7 +73,31 @@ def _footer(canvas: Canvas, template: BaseDocTemplate, text: str, pages: int | N
     canvas.drawRightString(A4[0] - MARGIN, 10 * mm, f"{template.page} of {pages}")
 
 
-def _text(text: str, size: float, face: str = "", right: bool = False, before: float = 0, after: float = 0) -> Text:
+class _Together(KeepTogether):
+    """Flowables that stay on one page, and can still be told apart."""
+
+    def __init__(self, parts: list[Flowable]) -> None:
+        super().__init__(parts)
+        self.parts = parts
+
+
+class _Heading(Text):
+    """Told apart for the page breaks."""
+
+
+class _Caption(Text):
+    """Told apart for the page breaks."""
+
+
+def _text(
+    text: str,
+    size: float,
+    face: str = "",
+    right: bool = False,
+    before: float = 0,
+    after: float = 0,
+    kind: type[Text] = Text,
+) -> Text:
     """One paragraph of plain text."""
     style = ParagraphStyle(
         f"{size}{face}{right}{before}{after}",
@@ -82,7 +108,7 @@ def _text(text: str, size: float, face: str = "", right: bool = False, before: f
         spaceBefore=before,
         spaceAfter=after,
     )
-    return Text(escape(text), style)
+    return kind(escape(text), style)
 
 
 def _register_fonts() -> None:
@@ -104,8 +130,7 @@ def _flowables(block: Block) -> list[Flowable]:
     match block:
         case Heading():
             size = 13 if block.level == 1 else 10.5
-            heading = _text(block.text, size, "-Bold", before=8, after=3)
-            heading.keepWithNext = 1
+            heading = _text(block.text, size, "-Bold", before=8, after=3, kind=_Heading)
             return [PageBreak(), heading] if block.new_page else [heading]
         case Paragraph():
             return [_text(block.text, 9 if block.note else 10, after=4)]
@@ -121,7 +146,7 @@ def _flowables(block: Block) -> list[Flowable]:
 
 def _drawing(drawing: Drawing, width: float = FRAME) -> Flowable:
     figure = FigureFlowable(drawing.figure, width)
-    return KeepTogether([figure, _text(drawing.caption, 8.5, before=2, after=5)])
+    return _Together([figure, _text(drawing.caption, 8.5, before=2, after=5)])
 
 
 def _gallery(gallery: Gallery) -> list[Flowable]:
@@ -190,25 +215,27 @@ def _table(table: Table) -> list[Flowable]:
     if foot:
         layout += [("LINEABOVE", (0, -len(foot)), (-1, -len(foot)), 0.6, colors.black)]
         layout += [("LINEBELOW", (0, -1), (-1, -1), 0.6, colors.black)]
-    caption = _text(table.caption, 8.5, before=3, after=2)
-    caption.keepWithNext = 1
+    caption = _text(table.caption, 8.5, before=3, after=2, kind=_Caption)
     content = [*head, *rows, *foot]
     if not content:
         return [caption]
     grid = Grid(content, [share * FRAME for share in shares], style=layout, repeatRows=len(head))
+    if len(content) <= ROWS_TOGETHER:
+        return [_Together([caption, grid]), Spacer(1, 6)]
     return [caption, grid, Spacer(1, 6)]
 
 
 def _keep_headings(story: list[Flowable]) -> list[Flowable]:
-    """A heading moves to the next page where less than a few lines would follow it."""
+    """Headings stay with what follows: with a figure or short table as a whole, else with its first lines."""
     kept: list[Flowable] = []
     for flowable in story:
-        before = kept[-1] if kept else None
-        if _binds(flowable) and not (isinstance(before, PageBreak) or _binds(before)):
-            kept.append(CondPageBreak(28 * mm))
+        last = kept[-1] if kept else None
+        if isinstance(flowable, _Together) and isinstance(last, _Heading):
+            kept[-1] = _Together([last, *flowable.parts])
+            continue
+        if isinstance(flowable, _Heading) and not isinstance(last, PageBreak | _Heading):
+            kept.append(CondPageBreak(32 * mm))
+        elif isinstance(flowable, _Caption):
+            kept.append(CondPageBreak(18 * mm))
         kept.append(flowable)
     return kept
-
-
-def _binds(flowable: Flowable | None) -> bool:
-    return bool(getattr(flowable, "keepWithNext", 0))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, MarkerSighting, Rejection
 from ...factors.rig import Board, Rig
-from ..undistort import distort, undistort
+from ..undistort import distort, undistort, undistorted_grid
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
 from .pattern_fit import PatternFit, Window, fit_patterns, surroundings
@@ -27,7 +27,7 @@ _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
 """Of the pattern's edges, what has to be seen as the model says."""
-_SETTLED_PX = 0.1
+_SETTLED_PX = 0.3
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
 
@@ -73,8 +73,7 @@ class MarkerFrontEnd:
         self._search = MarkerSearch(tuple(self._dictionaries.values()))
         self._positions: Float | None = None
         if not _is_pinhole(camera):
-            columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-            self._positions = undistort(camera, np.stack([columns, rows], -1))[0]
+            self._positions = undistorted_grid(camera)
 
     def process(self, stamp_ns: int, image: NDArray[np.uint8]) -> tuple[list[MarkerSighting], list[Rejection]]:
         """The markers in one image, and what was refused.
@@ -123,8 +122,8 @@ class MarkerFrontEnd:
         for cells in sorted({self._dictionaries[c.dictionary].cells for c in candidates}):
             group = [c for c in candidates if self._dictionaries[c.dictionary].cells == cells]
             starts = np.stack([self._ours(c, ideal) for c in group])
-            keep = np.isfinite(starts).all((1, 2))
-            group, starts = [c for c, k in zip(group, keep, strict=True) if k], starts[keep]
+            keep = np.flatnonzero(np.isfinite(starts).all((1, 2)))
+            group, starts = [group[k] for k in keep], starts[keep]
             if group:
                 patterns = [self._patterns[c.key] for c in group]
                 fit = fit_patterns(grey, starts, patterns, self._positions, self._windows(starts, cells, grey.shape))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -66,11 +67,13 @@ def all_names() -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def marker_dictionary(name: str) -> MarkerDictionary:
-    """The dictionary of that name (any spelling that `canonical_name` knows).
+    """The dictionary of that name (any spelling that `canonical_name` knows), or of a file in OpenCV's format.
 
     Raises:
-        RigError: OpenCV has no such dictionary.
+        RigError: OpenCV has no such dictionary, or the file cannot be read.
     """
+    if name.lower().endswith((".yml", ".yaml", ".json", ".xml")):
+        return _from_file(name)
     canonical = canonical_name(name)
     value = getattr(cv2.aruco, canonical, None)
     if value is None or not canonical.startswith("DICT_"):
@@ -78,3 +81,14 @@ def marker_dictionary(name: str) -> MarkerDictionary:
     opencv = cv2.aruco.getPredefinedDictionary(value)
     order = _FROM_OPENCV_APRILTAG if "APRILTAG" in canonical else _FROM_OPENCV
     return MarkerDictionary(canonical, opencv, opencv.markerSize + 2, order)
+
+
+def _from_file(name: str) -> MarkerDictionary:
+    """A user's own dictionary: `nmarkers`, `markersize`, `maxCorrectionBits` and the bits, as OpenCV writes them."""
+    if not Path(name).is_file():
+        raise RigError(f"dictionary file {name} is not there; give its path from where surecut is started")
+    opencv = cv2.aruco.Dictionary()
+    storage = cv2.FileStorage(name, cv2.FILE_STORAGE_READ)
+    if not opencv.readDictionary(storage.root()) or opencv.markerSize < 2:
+        raise RigError(f"dictionary file {name} is no dictionary in OpenCV's format")
+    return MarkerDictionary(name, opencv, opencv.markerSize + 2, _FROM_OPENCV)

@@ -15,12 +15,14 @@ edge line k at the blur's width there, and a first-order term for grid lines tha
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
+# NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
+Float = NDArray[Any]
+Single = NDArray[Any]
 Window = tuple[int, int, int, int]
 Windows = Sequence[Window]
 
@@ -40,6 +42,10 @@ _BLUR_RANGE_PX = (0.25, 4.0)
 _COARSE_BLUR_PX = 0.8
 """Least blur of the first stage: with a sharper model too few of its pixels would feel the edges."""
 _STEP_PX = 1.0
+_CAUTIOUS_AFTER, _CAUTION = 3, 0.6
+"""From that step on only a part of each is taken, which ends the swinging to and fro that outlying pixels can cause."""
+_BLOCK_PX, _BLOCK_PIXELS = 3, 8
+"""Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 _BLUR_STEP_PX2 = 2.0
 _COARSE_PX, _FINE_PX = 0.15, 0.012
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
@@ -71,7 +77,7 @@ class PatternFit:
     share: Float
     """Shape (m,), of the weight of the edges, what the robust fit has kept; small where the pattern is covered."""
     last_step_px: Float
-    """Shape (m,), what the last step moved a corner by; large where the fit did not settle."""
+    """Shape (m,), what the last step moved a corner by (part of the covariance); large where the fit did not settle."""
     noise_factor: Float
     """Shape (m,), how much residuals that hang together raise the variance over white noise of the same size."""
 
@@ -244,8 +250,10 @@ def _choose_pixels(
         here = np.column_stack([columns, rows]) if positions is None else positions[rows, columns]
         xy[k, :count], value[k, :count], weight[k, :count] = here - origin[k], image[rows, columns], 1.0
         if count:
-            across = (columns - columns.min()) // 3
-            block[k, :count] = (rows - rows.min()) // 3 * (across.max() + 1) + across
+            x0, y0, x1, y1 = windows[k]
+            size = max(_BLOCK_PX, int(np.sqrt((x1 - x0) * (y1 - y0) * _BLOCK_PIXELS / count)))
+            across = (columns - x0) // size
+            block[k, :count] = (rows - y0) // size * ((x1 - x0) // size + 1) + across
     return _Pixels(origin, xy, value, weight, block)
 
 
@@ -271,8 +279,8 @@ def _near_edges(
     a, b = a[inside], b[inside]
     corners = (H @ np.column_stack([_UNIT, np.ones(4)]).T).T
     corners = corners[:, :2] / corners[:, 2:]
-    u = np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3]) / 2
-    v = np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1]) / 2
+    u = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
+    v = float(np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1])) / 2
     near = _edge_within(a, b, pattern, reach_px * cells / u) | _edge_within(b, a, pattern.T, reach_px * cells / v)
     index = (rows * width + columns)[inside][near]
     scatter = (index * 2654435761) % 4294967296
@@ -303,7 +311,7 @@ def fit_patterns(
     patterns: list[Float],
     positions: Float | None = None,
     windows: Windows | None = None,
-    steps: int = 6,
+    steps: int = 8,
     blur_px: float = 1.2,
 ) -> PatternFit:
     """Corners of m markers with one pattern size, from near ones.
@@ -377,7 +385,7 @@ def _descend(
         lit = None if count == 0 and state.light is None else light[active]
         one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines, forgiven)
         largest = np.abs(one.step[:, :8]).max(1)
-        shrink = np.minimum(1.0, _STEP_PX / np.maximum(largest, 1e-9))
+        shrink = np.minimum(1.0 if count < _CAUTIOUS_AFTER else _CAUTION, _STEP_PX / np.maximum(largest, 1e-9))
         corners[active] += (one.step[:, :8] * shrink[:, None]).reshape(-1, 4, 2)
         blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
         light[active] = one.step[:, 11:]
@@ -481,7 +489,9 @@ def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
     freedom = np.maximum(weight.sum(1) - 21.0, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
     factor = _hang_together(solved, pixels, weight)
+    last_step = np.abs(solved.step[:, :8]).max(1)
     covariance = solved.inverse[:, :8, :8] * (variance * factor)[:, None, None]
+    covariance += (last_step**2)[:, None, None] * np.eye(8)
     return PatternFit(
         state.corners + pixels.origin[:, None],
         covariance,
@@ -490,7 +500,7 @@ def _summary(state: _State, solved: _Solved, pixels: _Pixels) -> PatternFit:
         np.sqrt(variance),
         _correlation(pixels.value, solved.residual, weight),
         _share(solved, pixels),
-        np.abs(solved.step[:, :8]).max(1),
+        last_step,
         factor,
     )
 

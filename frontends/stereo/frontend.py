@@ -25,6 +25,9 @@ from .vertical import VerticalCorrection
 
 Bool = NDArray[np.bool_]
 
+_FADING = 0.7
+"""Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
+
 
 class StereoFrontEnd:
     """Tracks, keyframes and a first-guess motion from stereo pairs in the order of their time.
@@ -332,16 +335,37 @@ class StereoFrontEnd:
         if found:
             chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
             last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
-        self._velocity = np.zeros(6)
+        self._velocity = _FADING * self._velocity
         return self._restart(pair, last_T_this, lost=True)
 
     def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
-        """A keyframe without living tracks."""
+        """A keyframe of landmarks seen again and new tracks; no keyframe where the view holds nothing to start from."""
         self._chain_T_keyframe = self._chain_T_keyframe @ self._keyframe_T_last @ last_T_this
         self._keyframe_T_last = np.eye(4)
         self._tracks = no_tracks(self._observer.grid)
         self._last = pair
-        return self._fill(self._observer.view(pair), nothing_seen(), last_T_this, 0, lost)
+        frame = self._fill(self._observer.view(pair), nothing_seen(), last_T_this, 0, lost)
+        if np.isfinite(frame.right_px[:, 0]).sum() >= self.settings.min_inliers:
+            return frame
+        self._tracks = no_tracks(self._observer.grid)
+        return _blind(pair.stamp_ns, last_T_this)
+
+
+def _blind(stamp_ns: int, last_T_this: Float) -> StereoFrame:
+    """A frame that shows nothing."""
+    seen = nothing_seen()
+    return StereoFrame(
+        stamp_ns=stamp_ns,
+        is_keyframe=False,
+        track_ids=np.zeros(0, dtype=np.int64),
+        left_px=seen.left_px,
+        left_covariance_px2=seen.left_covariance,
+        right_px=seen.right_px,
+        right_covariance_px2=seen.right_covariance,
+        last_T_this=last_T_this,
+        motion_inliers=0,
+        lost=True,
+    )
 
 
 def _apart(px: Float, others: Float, distance_px: float) -> Bool:

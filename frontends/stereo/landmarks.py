@@ -147,7 +147,7 @@ class LandmarkStore:
         first = align(smooth(image, _COARSE_SMOOTHING_PX), coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
         fine = make_patches(tiles, centres, grid, variance)
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
-        second = align(smoothed, fine, start, warp, grid)
+        second = align(smoothed, fine, start, warp, grid, 10)
         return second.px, fine, second.converged & (second.correlation > min_correlation)
 
     def revive(self, rows: NDArray[np.intp], raw_px: Float, ideal_px: Float, patches: Patches, points: Float) -> Tracks:

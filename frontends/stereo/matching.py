@@ -2,13 +2,10 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..undistort import distort
+from .flow import Image, inside
 from .geometry import Float, StereoGeometry, project, rays
-
-Image = NDArray[np.uint8]
-Bool = NDArray[np.bool_]
 
 _RIVAL = 0.04
 """A second peak within this correlation of the best makes a match ambiguous (repeating bricks)."""
@@ -43,33 +40,30 @@ def search_right(
     near = distort(rig.right, project(rig.right_points(direction * nearest_m), rig.right))
     # A ray that leaves the lens model's field on the near side is searched up to the rim of the image.
     near = np.where(np.isfinite(near), near, np.clip(far - [rig.right.width, 0.0], 0.0, None))
+    centre = np.rint(left_raw_px).astype(int)
+    limit = np.array([right.shape[1], right.shape[0]])
+    with np.errstate(invalid="ignore"):
+        ends = np.nan_to_num(np.stack((far, near)), nan=-1e6)
+        low = np.maximum(np.floor(ends.min(axis=0) - gate_px).astype(int) - radius_px, 0)
+        high = np.minimum(np.ceil(ends.max(axis=0) + gate_px).astype(int) + radius_px + 1, limit)
+    usable = np.isfinite(far).all(axis=1) & ((high - low) > 2 * radius_px).all(axis=1)
+    usable &= inside(centre.astype(np.float64), left.shape, radius_px)
     found = np.full((len(left_px), 2), np.nan)
-    for i in range(len(left_px)):
-        if np.isfinite(far[i]).all():
-            found[i] = _search(left, right, left_raw_px[i], far[i], near[i], gate_px, radius_px, min_correlation)
-    return found
+    for i in np.flatnonzero(usable).tolist():
+        u, v = centre[i].tolist()
+        template = left[v - radius_px : v + radius_px + 1, u - radius_px : u + radius_px + 1]
+        place = _best(right[low[i, 1] : high[i, 1], low[i, 0] : high[i, 0]], template, min_correlation)
+        if place is not None:
+            found[i] = place
+    return found + low + radius_px + (left_raw_px - centre)
 
 
-def _search(
-    left: Image, right: Image, px: Float, far: Float, near: Float, gate: float, radius: int, min_correlation: float
-) -> Float:
-    u, v = (round(value) for value in px.tolist())
-    template = left[max(v - radius, 0) : v + radius + 1, max(u - radius, 0) : u + radius + 1]
-    if template.shape != (2 * radius + 1, 2 * radius + 1):
-        return np.full(2, np.nan)
-    low = np.floor(np.minimum(far, near) - gate).astype(int) - radius
-    high = np.ceil(np.maximum(far, near) + gate).astype(int) + radius
-    low, high = np.maximum(low, 0), np.minimum(high, (right.shape[1] - 1, right.shape[0] - 1))
-    strip = right[low[1] : high[1] + 1, low[0] : high[0] + 1]
-    if strip.shape[0] < template.shape[0] or strip.shape[1] < template.shape[1]:
-        return np.full(2, np.nan)
+def _best(strip: Image, template: Image, min_correlation: float) -> tuple[int, int] | None:
+    """Column and row of the one place in the strip that the template fits."""
     correlation = cv2.matchTemplate(strip, template, cv2.TM_CCOEFF_NORMED)
-    _, best, _, place = cv2.minMaxLoc(correlation)
+    _, best, _, (column, row) = cv2.minMaxLoc(correlation)
     if best < min_correlation:
-        return np.full(2, np.nan)
-    column = correlation.max(axis=0)
-    column[max(place[0] - 3, 0) : place[0] + 4] = -1.0
-    if column.size and column.max() > best - _RIVAL:
-        return np.full(2, np.nan)
-    fraction = px - (u, v)
-    return np.array([place[0] + low[0] + radius, place[1] + low[1] + radius]) + fraction
+        return None
+    rivals = correlation.max(axis=0)
+    rivals[max(column - 3, 0) : column + 4] = -1.0
+    return None if rivals.max() > best - _RIVAL else (column, row)

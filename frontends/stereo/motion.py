@@ -60,13 +60,15 @@ def estimate_motion(
         return None
     data = _Problem(points, points_covariance, px, px_covariance, rig)
     candidates = list(predicted)
+    # The weights hardly depend on the pose: those of one serve until the end.
+    information = data.information(candidates[0] if candidates else np.eye(4))
     consensus = _consensus(points, px[:, :2], rig)
     if consensus is not None:
         candidates.append(consensus)
-    start = min(candidates, key=data.cost)
-    pose = min((data.refine(start), start), key=data.cost)
-    chi2 = data.chi2(pose)
-    inliers = chi2 < data.gate * data.excess(pose)
+    start = min(candidates, key=lambda pose: data.cost(pose, information))
+    pose = min((data.refine(start, information), start), key=lambda pose: data.cost(pose, information))
+    chi2 = data.chi2(pose, data.information(pose))
+    inliers = chi2 < data.gate * data.excess(chi2)
     if inliers.sum() < min_inliers:
         return None
     return Motion(pose, inliers, chi2)
@@ -122,29 +124,30 @@ class _Problem:
         here[:, 2] = np.maximum(here[:, 2], 1e-3)
         return here
 
-    def _information(self, pose: Float, here: Float) -> Float:
-        jacobian = self._jacobian(here) @ pose[:3, :3].T
+    def information(self, pose: Float) -> Float:
+        """Weights (n, k, k) of the residuals: inverse covariance of pixels and of points seen from `pose`."""
+        jacobian = self._jacobian(self._here(pose)) @ pose[:3, :3].T
         covariance = self.px_cov + jacobian @ self.points_cov @ jacobian.transpose(0, 2, 1)
         return np.asarray(np.linalg.inv(covariance), dtype=np.float64)
 
-    def chi2(self, pose: Float) -> Float:
-        here = self._here(pose)
-        return _square(self._residuals(here), self._information(pose, here))
+    def chi2(self, pose: Float, information: Float) -> Float:
+        """Squared residuals (n,) in sigmas."""
+        return _square(self._residuals(self._here(pose)), information)
 
-    def cost(self, pose: Float) -> float:
-        return float(np.minimum(self.chi2(pose) / self.gate, 1.0).sum())
+    def cost(self, pose: Float, information: Float) -> float:
+        """Truncated squares: what outliers cost is bounded."""
+        return float(np.minimum(self.chi2(pose, information) / self.gate, 1.0).sum())
 
-    def excess(self, pose: Float) -> float:
-        """By how much the squared residuals exceed their covariance, from the median; at least one."""
-        return float(np.clip(np.median(self.chi2(pose) / self.expected), 1.0, 16.0))
+    def excess(self, chi2: Float) -> float:
+        """By how much squared residuals (n,) exceed their covariance, from the median; at least one."""
+        return float(np.clip(np.median(chi2 / self.expected), 1.0, 16.0))
 
-    def refine(self, pose: Float, steps: int = 10) -> Float:
+    def refine(self, pose: Float, information: Float, steps: int = 10) -> Float:
         """Gauss-Newton with the weights of Geman and McClure; the pose is moved from the right.
 
         They fall off faster than the pull of near points grows, so that an arm close to the lens is let go.
         """
-        scale = self.gate * self.excess(pose)
-        information = self._information(pose, self._here(pose))
+        scale = self.gate * self.excess(self.chi2(pose, information))
         for _ in range(steps):
             here = self._here(pose)
             residual = self._residuals(here)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..undistort import undistort
-from .geometry import Float, StereoGeometry, rotation_angle
+from .geometry import Float, StereoGeometry
 from .images import Float32, Image
 from .motion import estimate_motion
 from .tracks import Int
@@ -72,16 +72,24 @@ class PlaceStore:
         if known.sum() < 25:
             return
         place = Place(stamp_ns, pose.copy(), left, _thumbnail(left), ids[known], raw_px[known], points[known])
-        depth = float(np.median(points[known, 2]))
-        for index, old in enumerate(self._places):
-            apart = np.linalg.norm(old.chain_T_keyframe[:3, 3] - pose[:3, 3])
-            if apart < 0.1 * depth and rotation_angle(old.chain_T_keyframe[:3, :3].T @ pose[:3, :3]) < 0.15:
-                if len(old.ids) < 0.7 * len(place.ids):
-                    self._places[index] = place
-                return
+        near = self._same_view(pose, 0.1 * float(np.median(points[known, 2])))
+        if near is not None:
+            if len(self._places[near].ids) < 0.7 * len(place.ids):
+                self._places[near] = place
+            return
         self._places.append(place)
         if len(self._places) > self._capacity:
             del self._places[min(range(len(self._places) - 1), key=lambda index: len(self._places[index].ids))]
+
+    def _same_view(self, pose: Float, distance_m: float) -> int | None:
+        """The first place within a distance and nine degrees of a pose."""
+        if not self._places:
+            return None
+        poses = np.array([place.chain_T_keyframe for place in self._places])
+        apart = np.linalg.norm(poses[:, :3, 3] - pose[:3, 3], axis=1)
+        cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], pose[:3, :3]) - 1.0) / 2.0
+        near = np.flatnonzero((apart < distance_m) & (cosine > np.cos(0.15)))
+        return int(near[0]) if len(near) else None
 
     def find(self, left: Image, min_inliers: int) -> list[Relocalisation]:
         """Places that the left image shows, the one with most inliers first."""

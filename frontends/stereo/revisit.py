@@ -18,6 +18,8 @@ _DRIFT_PX = 1.5
 """Standard deviation of a stored point against its neighbours, seen from here."""
 _LEAST = 6
 """Fewer finds do not verify each other."""
+_ENOUGH = 25
+"""Fewer finds do not hold the pose better than the chain does."""
 
 
 def revisit(
@@ -43,7 +45,7 @@ def revisit(
         settings: thresholds.
 
     Returns:
-        tracks, sighting and `this_T_corrected` (4, 4), the identity without finds.
+        tracks, sighting and `this_T_corrected` (4, 4), the identity without enough finds.
     """
     nothing = no_tracks(observer.grid), nothing_seen(), np.eye(4)
     if len(rows) < _LEAST:
@@ -64,7 +66,7 @@ def revisit(
     found &= np.isfinite(left_px).all(axis=1)
     motion = _agreement(here[found], left_px[found], rig) if found.sum() >= _LEAST else None
     if motion is None:
-        store.missed(rows[~found])
+        # A covered lens or a pose that is far off hides them all; that is not the landmarks' fault.
         return nothing
     chosen = np.flatnonzero(found)[motion.inliers]
     store.missed(np.delete(rows, chosen))
@@ -72,7 +74,7 @@ def revisit(
     tracks = store.revive(rows[chosen], raw_px[chosen], left_px[chosen], patches.take(chosen), corrected)
     pose = chain_T_this @ motion.reference_T_this
     tracks, sighting = _observe(view, store, rows[chosen], tracks, pose, observer, rig, vertical)
-    return tracks, sighting, motion.reference_T_this
+    return tracks, sighting, motion.reference_T_this if len(chosen) >= _ENOUGH else np.eye(4)
 
 
 def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | None:

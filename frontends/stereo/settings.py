@@ -44,5 +44,5 @@ class StereoSettings:
     """Number of old landmarks that each keyframe looks for."""
     store_keyframes: int = 400
     """Number of keyframes that are remembered for relocalisation."""
-    store_landmarks: int = 20000
+    store_landmarks: int = 10000
     """Number of landmark patches that are remembered."""

@@ -1,0 +1,114 @@
+"""One run at pixel level: render a recording, estimate from it as from any other, and read its truth afterwards."""
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..estimator.compare import chain_of_messages
+from ..estimator.optimise import optimise, rig_of
+from ..estimator.pipeline import wanted_topics
+from ..factors.errors import LogError, SurecutError
+from ..io.messages import PointsBody, PoseBody
+from ..io.reader import LogReader
+from .campaign_row import Row, failed_row, row_of
+from .evaluate import evaluate
+from .measurement_level_truth import TrueCamera, TruePipe, TrueRig, Truth
+from .recording import simulate
+from .scenario import Scenario
+
+POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
+POINTS = "/truth/points"
+
+
+def run_pixels(number: int, scenario: Mapping[str, Any]) -> Row:
+    """Renders with the run's number as seed, into a folder that is gone afterwards."""
+    wanted = Scenario.model_validate(dict(scenario))
+    with TemporaryDirectory(prefix="surecut-campaign-") as folder:
+        log = Path(folder) / "run.mcap"
+        simulate(log, wanted, number, workers=1)
+        return row_of_log(number, wanted.name, log)
+
+
+def row_of_log(number: int, name: str, log: Path) -> Row:
+    """Estimate of a simulated log and its errors."""
+    begin = time.perf_counter()
+    try:
+        result = optimise(log)
+    except SurecutError as error:
+        return failed_row(number, name, str(error))
+    seconds = time.perf_counter() - begin
+    truth = truth_of_log(log)
+    row = row_of(number, name, result, evaluate(result, truth))
+    row["seconds"] = seconds
+    row["chain"] = chain_errors_of_log(log, truth)
+    return row
+
+
+def chain_errors_of_log(log: Path, truth: Truth) -> list[float]:
+    """Error of the paper's chain at every click that it answers, m."""
+    try:
+        with LogReader(log, ()) as reader:
+            rig = rig_of(reader, None)
+        with LogReader(log, wanted_topics(rig)) as reader:
+            points = chain_of_messages(reader, rig)
+    except SurecutError:
+        return []
+    return [
+        float(np.linalg.norm(point.position_b_m - truth.points_b_m[point.point_id]))
+        for point in points
+        if point.position_b_m is not None and point.point_id in truth.points_b_m
+    ]
+
+
+def truth_of_log(log: Path) -> Truth:
+    """The truth that a simulated log carries. Where the machine was moved: its last station.
+
+    Raises:
+        LogError: the log carries none.
+    """
+    poses: dict[str, dict[int, np.ndarray]] = {name: {} for name in POSES}
+    names = {topic: name for name, topic in POSES.items()}
+    points: dict[str, np.ndarray] = {}
+    with LogReader(log, (*POSES.values(), POINTS)) as reader:
+        for message in reader:
+            if isinstance(message.body, PoseBody):
+                poses[names[message.topic]][message.stamp_ns] = message.body.matrix
+            elif isinstance(message.body, PointsBody):
+                points |= dict(zip(message.body.ids, message.body.points_m, strict=True))
+        text = reader.attachment("truth.yaml")
+    if text is None or not all(poses.values()):
+        raise LogError(f"{log}: carries no truth; only simulated logs do")
+    stamps = sorted(poses["m"])
+    last_b, last_f = (poses[name][max(poses[name])] for name in ("b", "f"))
+    known = yaml.safe_load(text)
+    return Truth(
+        stamps_ns=tuple(stamps),
+        o_T_m=np.array([poses["m"][stamp] for stamp in stamps]),
+        o_T_b=last_b,
+        o_T_f={"f0": last_f},
+        points_b_m=points,
+        pipe=TruePipe(
+            np.array(known["pipe"]["point_m"]), np.array(known["pipe"]["axis"]), float(known["pipe"]["radius_m"])
+        ),
+        rig=_true_rig(known),
+    )
+
+
+def _true_rig(known: Mapping[str, Any]) -> TrueRig:
+    """Boards are left out: the side as it appears to a detector is no property of the page."""
+    scale = float(known["depth_scale"])
+    return TrueRig(
+        cameras={name: TrueCamera(name, 0, 0, np.array(camera["K"])) for name, camera in known["cameras"].items()},
+        m_left_T_m_right=np.array(known["left_T_right"]),
+        b_T_rgb=np.array(known["b_T_rgb"]),
+        f_T_b=np.array(known["f_T_b"]),
+        # The sensor reads z (1 + scale) + offset; the state is what turns a reading into the true depth.
+        depth_offset_m=-float(known["depth_offset_m"]) / (1.0 + scale),
+        depth_scale=1.0 / (1.0 + scale) - 1.0,
+        boards={},
+    )

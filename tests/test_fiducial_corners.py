@@ -1,0 +1,101 @@
+"""Corners against rendered truth: bias, scatter, honesty, and the order of the corners."""
+
+import numpy as np
+import pytest
+from fiducial_scenes import PAGE_M, a4_board, camera, pose
+
+from surecut.factors.rig import Rig
+from surecut.frontends.fiducials.detector import MarkerFrontEnd
+from surecut.frontends.fiducials.dictionaries import all_names, canonical_name, marker_dictionary
+from surecut.simulation.marker_images import Photography, marker_corners, project, render_board
+
+
+def measure(board, lens, poses, taken, seed=0):
+    """Errors (n, 4, 2), outward parts and normalised squares of all corners."""
+    rng = np.random.default_rng(seed)
+    errors, outward, nees = [], [], []
+    for camera_T_f in poses:
+        image = render_board(board, PAGE_M, lens, camera_T_f, taken, rng)
+        truth = {k: project(lens, camera_T_f, c) for k, c in marker_corners(board).items()}
+        for s in MarkerFrontEnd(Rig(boards=(board,)), lens, "m_left").process(0, image)[0]:
+            error = s.corners_px - truth[s.marker]
+            away = truth[s.marker] - truth[s.marker].mean(0)
+            errors.append(error)
+            outward.append((error * away).sum(1) / np.linalg.norm(away, axis=1))
+            nees.append(np.einsum("ki,kij,kj->k", error, np.linalg.inv(s.covariance_px2), error) / 2)
+    return np.array(errors), np.array(outward), np.array(nees)
+
+
+@pytest.mark.parametrize(
+    ("focal", "distance", "tilt", "blur", "noise"),
+    [(270, 1.1, 0, 0.8, 2.0), (270, 0.7, 40, 0.6, 2.0), (400, 0.6, 25, 1.5, 3.0), (500, 0.7, 50, 1.8, 2.0)],
+)
+def test_no_bias_and_an_honest_covariance(focal, distance, tilt, blur, noise):
+    lens = camera(int(focal * 0.45 / distance), int(focal * 0.45 / distance), focal)
+    poses = [pose(tilt, 70.0 * k, 23.0 * k, [0.001 * k, 0.002, distance]) for k in range(6)]
+    errors, outward, nees = measure(a4_board(), lens, poses, Photography(blur_px=blur, noise=noise, shading=(0.2, 0.1)))
+    assert len(errors) >= 20
+    assert abs(outward.mean()) < 0.01
+    assert np.abs(errors.mean((0, 1))).max() < 0.01
+    assert np.sqrt((errors**2).mean()) < 0.04
+    assert 0.6 < nees.mean() < 1.4
+
+
+def test_motion_blur_moves_no_corner():
+    lens = camera(300, 300, 400)
+    poses = [pose(20.0, 50.0 * k, 31.0 * k, [0.0, 0.0, 0.6]) for k in range(4)]
+    errors, outward, nees = measure(a4_board(), lens, poses, Photography(motion_px=(3.0, 2.0)))
+    assert len(errors) == 16
+    assert abs(outward.mean()) < 0.03
+    assert nees.mean() < 2.0
+
+
+def test_a_lens_that_bends_lines():
+    lens = camera(180, 120, 135, "plumb_bob", (-0.3, 0.1, 0.001, -0.001, 0.0))
+    errors, outward, _ = measure(a4_board(), lens, [pose(25.0, 30.0, 10.0, [-0.08, 0.03, 0.45])], Photography())
+    assert len(errors) == 4
+    assert np.sqrt((errors**2).mean()) < 0.05
+    assert abs(outward.mean()) < 0.03
+
+
+@pytest.mark.parametrize(
+    "dictionary", ["DICT_4X4_50", "DICT_6X6_250", "DICT_APRILTAG_36h11", "tag25h9", "DICT_ARUCO_ORIGINAL"]
+)
+def test_corner_order_and_small_markers(dictionary):
+    # 18 px wide, upright: corner 0 is the lower left one of the printed marker
+    lens = camera(240, 240, 270)
+    errors, _, _ = measure(
+        a4_board(dictionary, side_m=0.075), lens, [pose(15.0, 20.0, 3.0, [0, 0, 1.12])], Photography()
+    )
+    assert len(errors) >= 3
+    assert np.abs(errors).max() < 0.15
+
+
+def test_a_covered_corner_is_left_to_the_rest():
+    board, lens = a4_board(), camera(300, 300, 400)
+    camera_T_f = pose(15.0, 20.0, 3.0, [0, 0, 0.6])
+    image = render_board(board, PAGE_M, lens, camera_T_f, Photography(), np.random.default_rng(0))
+    true = project(lens, camera_T_f, marker_corners(board)[0])
+    x, y = np.rint(true[1]).astype(int)
+    # a small glare, not so large that the marker cannot be read
+    image[y - 3 : y + 2, x - 2 : x + 3] = 255
+    sightings, _ = MarkerFrontEnd(Rig(boards=(board,)), lens, "m_left").process(0, image)
+    found = {s.marker: s for s in sightings}
+    assert np.abs(found[0].corners_px - true).max() < 0.15
+
+
+def test_names_of_families():
+    assert canonical_name("tag36h11") == canonical_name("36h11") == "DICT_APRILTAG_36h11"
+    assert canonical_name("DICT_ARUCO_MIP_36H12") == "DICT_ARUCO_MIP_36h12"
+    assert canonical_name("tagStandard41h12") == "tagStandard41h12"
+    assert len(all_names()) == 22
+
+
+@pytest.mark.parametrize("name", all_names())
+def test_patterns_have_a_black_border_and_differ_from_their_turns(name):
+    dictionary = marker_dictionary(name)
+    pattern = dictionary.pattern(1)
+    border = np.concatenate([pattern[0], pattern[-1], pattern[:, 0], pattern[:, -1]])
+    assert pattern.shape == (dictionary.cells, dictionary.cells)
+    assert not border.any()
+    assert all((np.rot90(pattern, k) != pattern).any() for k in (1, 2, 3))
