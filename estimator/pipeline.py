@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
-OUTLINE_SPACING_M = 0.05
+OUTLINE_SPACING_M = 0.12
 """Views of a pipe nearer to each other than this tell nothing new."""
 OUTLINE_PRIOR = (0.006, 0.02, 0.008)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
