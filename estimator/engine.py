@@ -380,7 +380,9 @@ class Engine:
             for b in self._waiting
         ]
         waiting += [
-            Rejection(p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0)
+            Rejection(
+                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp, frames", 0.0, 1.0
+            )
             for p in self.lost_picks()
         ]
         return [
