@@ -27,7 +27,7 @@ from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose
 from ..factors.measurements import CloudFrame, Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.noise import sigmas
-from ..factors.rig import Rig
+from ..factors.rig import Distance, Rig
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .graph import Record, State, Update
@@ -302,7 +302,7 @@ class Engine:
                 continue
             update = Update()
             factor = distance_factor(a, b, distance.distance_m, sigmas([distance.sigma_m]))
-            what = f"distance {distance.point_a} to {distance.point_b}"
+            what = distance_name(distance)
             update.add(factor, Record(DISTANCES, what, stamp_ns, what, rejectable=False))
             self._take(update)
         self._distances_open = still
@@ -395,6 +395,11 @@ class Engine:
 
     def everything_told(self) -> list[Event]:
         return [*self.events, *self.boards.events]
+
+
+def distance_name(distance: Distance) -> str:
+    """How the factor of a known distance is called in its record."""
+    return f"distance {distance.point_a} to {distance.point_b}"
 
 
 def _prior(name: str, stamp_ns: int) -> Record:
