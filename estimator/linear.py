@@ -1,6 +1,7 @@
 """The linearised problem as one sparse system: covariances of anything, and what each factor contributes."""
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -101,11 +102,11 @@ class LinearSystem:
                 continue
             right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
             at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
-            for column, start, stop in zip(columns, at[:-1], at[1:], strict=True):
+            for column, (start, stop) in zip(columns, pairwise(at), strict=True):
                 right[column, start:stop] = np.eye(stop - start)
             inverse = self.solve(right)
             outer = middle @ inverse
-            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in zip(at[:-1], at[1:], strict=True)]
+            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in pairwise(at)]
         return found
 
     def hats(self, positions: Sequence[int]) -> list[Float]:
@@ -116,7 +117,7 @@ class LinearSystem:
             A = vstack([self.A[r] for r in rows]).tocsr()
             hat = A @ self.solve(A.T.toarray())
             at = np.concatenate([[0], np.cumsum([r.stop - r.start for r in rows])])
-            found += [hat[a:b, a:b].copy() for a, b in zip(at[:-1], at[1:], strict=True)]
+            found += [hat[a:b, a:b].copy() for a, b in pairwise(at)]
         return found
 
     def standardised(self, positions: Sequence[int]) -> list[tuple[float, int]]:

@@ -1,4 +1,4 @@
-"""A small recording of a cell, written in a moment: detected markers of one board from a moving stereo camera, and picks.
+"""A small recording of a cell, written in a moment: markers of one board seen by a moving stereo camera, and picks.
 
 The messages come as a list, so that a test can spoil what it is about before the log is written.
 """

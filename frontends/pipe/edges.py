@@ -93,9 +93,7 @@ def _slopes(patch: Float32, centre: Float, theta: Float, reach: int) -> Float32:
     u = np.float32(centre[0]) + across * cosine - along[:, None] * sine
     v = np.float32(centre[1]) + across * sine + along[:, None] * cosine
     flat = (-1, len(across))
-    turned = cv2.remap(
-        patch, u.reshape(flat), v.reshape(flat), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan,) * 4
-    )
+    turned = cv2.remap(patch, u.reshape(flat), v.reshape(flat), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan,) * 4)
     means = turned.reshape(len(theta) * _STRETCHES, _STRETCH, len(across)).mean(axis=1)
     taps = np.arange(-4, 5, dtype=np.float32)
     kernel = taps * np.exp(-0.5 * (taps / _DERIVATIVE_SIGMA) ** 2)
