@@ -349,7 +349,7 @@ class Engine:
         ]
         waiting += [
             Rejection(
-                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0
+                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp, frames", 0.0, 1.0
             )
             for p in self.lost_picks()
         ]
