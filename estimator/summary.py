@@ -10,10 +10,11 @@ from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_ri
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
 from ..factors.rig import dump_rig
+from . import dark_uncertainty
 from .batch import BatchSolution
 from .consistency import family_tests, judge, prior_tests
 from .correlation import track_inflation
-from .engine import Engine
+from .engine import Engine, distance_name
 from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
@@ -59,13 +60,14 @@ class Summary:
         engine = self._engine
         consistency = self._consistency()
         points = self._points()
+        distances = self._distances(between)
         return Result(
             points=points,
             poses=self._poses(),
             trajectory=self._trajectory(),
             pipes=self._pipes(points),
             calibration=self._calibration(),
-            distances=self._distances(between),
+            distances=distances,
             consistency=consistency,
             rejected=(*engine.everything_rejected(), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
@@ -260,6 +262,7 @@ class Summary:
     def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
         rig = self._engine.rig
         found = []
+        dark = self._dark_variance()
         asked = [(d.point_a, d.point_b, d.distance_m, d.sigma_m) for d in rig.distances]
         for a, b, given, given_sigma in [*asked, *((a, b, None, None) for a, b in between)]:
             estimate = self._distance(a, b)
@@ -267,8 +270,18 @@ class Summary:
                 if given is None:
                     raise ObservabilityError(f"distance {a} to {b}: one of the two markers was never placed by the log")
                 continue
-            found.append(DistanceEstimate(f"{a} to {b}", *estimate, given, given_sigma))
+            length, sigma = estimate
+            found.append(DistanceEstimate(f"{a} to {b}", length, float(np.hypot(sigma, dark**0.5)), given, given_sigma))
         return tuple(found)
+
+    def _dark_variance(self) -> float:
+        """Variance that the given distances show beyond the model; tells the user."""
+        sigmas = {distance_name(d): d.sigma_m for d in self._engine.rig.distances}
+        rows = [(i, sigmas[r.what]) for i, (_, _, r) in enumerate(self._active) if r.what in sigmas]
+        variance = dark_uncertainty.of_distances(self._system, [i for i, _ in rows], np.array([s for _, s in rows]))
+        if variance > 0.0:
+            self._engine.events.append(dark_uncertainty.event(variance, len(rows), self._engine.end_ns))
+        return variance
 
     def _distance(self, a: str, b: str) -> tuple[float, float] | None:
         points = [self._engine.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]
