@@ -27,11 +27,11 @@ Window = tuple[int, int, int, int]
 Windows = Sequence[Window]
 
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-_MAX_PIXELS = 420
+_MAX_PIXELS = 512
 """Pixels per marker; more cost time and give nothing that the model's own error does not swamp."""
-_FEW_PIXELS = 200
+_FEW_PIXELS = 240
 """Of them, those that the first steps use."""
-_COARSE_LATTICE, _LATTICE = 800, 2500
+_COARSE_LATTICE, _LATTICE = 3000, 9000
 """Pixels of a marker that are looked at to choose from."""
 _COARSE_REACH_PX = 3.0
 _REACH_PX, _REACH_BLURS = 0.7, 2.2
@@ -47,7 +47,7 @@ _CAUTIOUS_AFTER, _CAUTION = 3, 0.6
 _BLOCK_PX, _BLOCK_PIXELS = 3, 8
 """Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 _BLUR_STEP_PX2 = 2.0
-_COARSE_PX, _FINE_PX = 0.25, 0.012
+_COARSE_PX, _FINE_PX = 0.12, 0.012
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
 _COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
 """Edges may be that far off, beside the noise, before their pixels lose weight, in either stage."""
