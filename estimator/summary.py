@@ -10,6 +10,7 @@ from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_ri
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
 from ..factors.rig import dump_rig
+from .advice import advise
 from .batch import BatchSolution
 from .consistency import family_tests, judge, prior_tests
 from .correlation import track_inflation
@@ -76,6 +77,7 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
+            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
         )
 
     # Points ---------------------------------------------------------------------------------------------------
