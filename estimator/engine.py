@@ -28,6 +28,7 @@ from ..factors.links import gauge_prior, mount_factor, mount_pose
 from ..factors.measurements import CloudFrame, Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.noise import sigmas
 from ..factors.rig import Rig
+from ..frontends.pick_image import CutOut
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .graph import Record, State, Update
@@ -69,6 +70,10 @@ class Engine:
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
+        self.picks: list[Pick] = []
+        """All clicks, also those that were refused."""
+        self.pick_images: dict[tuple[str, int, str], CutOut] = {}
+        """What was clicked, by camera, stamp and point id, where there is an image."""
         self.keyframe_at: dict[int, int] = {}
         """Stamp to keyframe index."""
         self._recent: dict[int, tuple[StereoFrame, int, Float]] = {}
@@ -312,6 +317,7 @@ class Engine:
         return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
 
     def _pick(self, pick: Pick, depth_m: tuple[float, float] | None) -> None:
+        self.picks.append(pick)
         where = self.seen_from(pick.camera, pick.stamp_ns)
         if where is None:
             self.rejected.append(

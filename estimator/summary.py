@@ -19,6 +19,7 @@ from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
 from .odometry import FAMILY as ODOMETRY
+from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
     CalibrationEstimate,
@@ -78,6 +79,8 @@ class Summary:
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
             advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            pick_views=pick_views(engine, self._values, self._system),
+            picks=pick_records(engine),
         )
 
     # Points ---------------------------------------------------------------------------------------------------

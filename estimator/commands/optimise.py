@@ -1,5 +1,7 @@
 """Estimate pipe points in {b}, poses and calibration from recorded logs, jointly and with covariances."""
 
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +44,8 @@ class Job:
     json: Path | None
     tum: Path | None
     between: tuple[tuple[str, str], ...]
+    command: str = ""
+    """As the user typed it."""
 
 
 def command(
@@ -97,7 +101,8 @@ def _job(
             return None
         return target / f"{log.stem}{suffix}" if several or target.is_dir() else target
 
-    return Job(log, place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"), between)
+    typed = shlex.join(["surecut", *sys.argv[1:]])
+    return Job(log, place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"), between, typed)
 
 
 def _done(job: Job) -> bool:
@@ -116,7 +121,7 @@ def _done(job: Job) -> bool:
 
 def run_job(job: Job) -> str:
     """One log; returns one line. Top level, so that processes and clusters can take it."""
-    result = optimise(job.log, job.rig, job.between)
+    result = optimise(job.log, job.rig, job.between, command=job.command)
     _write(job, result)
     radius = max((p.radius95_m for p in result.points), default=float("nan"))
     state = "consistent" if result.consistency.passed else "INCONSISTENT"
@@ -153,7 +158,7 @@ def _with_progress(job: Job) -> Result:
         def advance(stamp_ns: int) -> None:
             bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
-        result = optimise(job.log, job.rig, job.between, advance)
+        result = optimise(job.log, job.rig, job.between, advance, job.command)
     _write(job, result)
     return result
 
