@@ -1,5 +1,7 @@
 """From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ from .result import (
     PoseEstimate,
     Result,
 )
+from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
 
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
@@ -62,11 +65,14 @@ class Summary:
         engine = self._engine
         consistency = self._consistency()
         points = self._points()
+        pipes = self._pipes(points)
+        around = surroundings(engine, self._values, self._system)
+        points = tuple(self._with_surface(p, pipes, around) for p in points)
         return Result(
             points=points,
             poses=self._poses(),
             trajectory=self._trajectory(),
-            pipes=self._pipes(points),
+            pipes=pipes,
             calibration=self._calibration(),
             distances=self._distances(between),
             consistency=consistency,
@@ -81,6 +87,7 @@ class Summary:
             advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
+            surroundings=compact_map(around),
         )
 
     # Points ---------------------------------------------------------------------------------------------------
@@ -112,6 +119,16 @@ class Summary:
             pipe_id=point.pipe if point.on_axis else None,
             budget=self._budget(influence),
         )
+
+    def _with_surface(
+        self, point: PointEstimate, pipes: tuple[PipeEstimate, ...], around: Surroundings | None
+    ) -> PointEstimate:
+        """What is next to a point on a pipe. Without a pipe the map cannot be told from what is to be cut."""
+        own = next((pipe for pipe in pipes if pipe.id == point.pipe_id), None)
+        if own is None or around is None:
+            return point
+        key = keys.point(self._engine.pipes.points[point.id].index)
+        return replace(point, nearest_surface=nearest_surface(around, point, own, key, self._values, self._system))
 
     def _axis(self, index: int) -> Float:
         o_T_b = self._values.atPose3(keys.base(0))
