@@ -17,7 +17,7 @@ from ..factors import keys
 from . import advice_factors as factors
 from .advice_places import Places, clicked_views
 from .advice_scene import Active, Surroundings, View
-from .advice_update import Joint, Predicted, reweighted
+from .advice_update import Joint, Predicted, measured_again
 from .engine import Engine
 from .linear import LinearSystem
 from .pipes import AXIS_ROLES
@@ -104,15 +104,15 @@ class Planner:
         point = keys.point(self._engine.pipes.points[point_id].index)
         for c in clicked_views(self.scene, point_id):
             again = factors.click(self.scene, point, c.key, c.o_T_c, c.camera)
-            detail = f"once more in {c.camera} at {utc(c.stamp_ns)}"
+            detail = f"once more in {c.camera} at {_moment(c.stamp_ns)}"
             yield Plan("repeat", f"Click {point_id} again", detail, [again], point_id)
 
     def _recorded(self, point_id: str) -> Iterator[Plan]:
         outlined = {s.stamp_ns for _, s in self._engine.pipes.outlined}
         for place, stamp_ns in self.places.recorded(point_id):
             found = self._pick_and_edges(point_id, place.view, stamp_ns not in outlined)
-            detail = f"m_left at {utc(stamp_ns)}, {place.text}"
-            yield Plan("recorded", f"Click {point_id} in one more recorded image", detail, found, point_id)
+            detail = f"m_left at {_moment(stamp_ns)}, {place.text}"
+            yield Plan("recorded", f"Click {point_id} in another image", detail, found, point_id)
 
     def _new_view(self, point_id: str) -> Iterator[Plan]:
         for place in self.places.round_the_pipe(point_id):
@@ -120,7 +120,7 @@ class Planner:
                 *factors.ties(self.scene, place.view, self._inflation),
                 *self._pick_and_edges(point_id, place.view, True),
             ]
-            yield Plan("view", f"Look at {point_id} from one more side and click it", place.text, found, point_id)
+            yield Plan("view", f"View and click {point_id} from another side", place.text, found, point_id)
 
     def _pick_and_edges(self, point_id: str, view: View, with_edges: bool) -> list[Predicted]:
         known = self._engine.pipes.points[point_id]
@@ -145,8 +145,8 @@ class Planner:
         found = factors.mount_again(self.scene)
         mount = self._engine.rig.mount
         if found and mount is not None:
-            sigma = f"{1e3 * mount.translation_sigma_m / 2:.2g} mm and {1e3 * mount.rotation_sigma_rad / 2:.2g} mrad"
-            detail = f"board {mount.board} to the Kinect, to {sigma}: half of what the rig file states"
+            sigma = f"{1e3 * mount.translation_sigma_m / 2:.2g} mm, {1e3 * mount.rotation_sigma_rad / 2:.2g} mrad"
+            detail = f"{mount.board} to Kinect within {sigma}: half of now"
             yield Plan("mount", "Measure the mount again", detail, found)
 
     def _second_board(self) -> Iterator[Plan]:
@@ -159,8 +159,8 @@ class Planner:
         view, o_T_f, text = place
         new = gtsam.Values()
         found = factors.second_board(scene, new, rig.boards[0], o_T_f, view)
-        action = "Put up a second board that Kinect and mobile camera both see"
-        detail = f"like {rig.boards[0].id}, {text}"
+        action = "Add a second board that both see"
+        detail = text
         yield Plan("second board", action, detail, [*factors.ties(scene, view, self._inflation), *found], None, new)
 
     def more_frames(
@@ -174,13 +174,13 @@ class Planner:
         total = cloud.sigma_m**2 + cloud.bias_m**2
         noise = np.clip(cloud.sigma_m**2 - cloud.bias_m**2, 0.0, None)
         gain = float(np.median(total / (total - noise * (1 - 1 / MORE_FRAMES))))
-        weights = np.repeat(np.where(of_cloud, gain, 1.0), system.rows)
+        rows = np.repeat(of_cloud, system.rows)
         told: dict[str, list[Advice]] = {}
         action = "Average more Kinect images"
         detail = f"{MORE_FRAMES} times as many while the machine stands still"
         blocks = {p.id: point_blocks(self.scene.values, keys.base(0), self._key(p.id))[1] for p in points}
         stacked = _stacked([blocks[p.id] for p in points])
-        covariance = reweighted(system, weights, stacked)
+        covariance = measured_again(system, rows, gain, stacked)
         for i, p in enumerate(points):
             part = covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
             told[p.id] = [_told(p, action, detail, part)]
@@ -215,6 +215,14 @@ def _told(point: PointEstimate, action: str, detail: str, covariance: Float) -> 
     radius = radius95(covariance)
     gain = 1.0 - radius / point.radius95_m if point.radius95_m > 0 else 0.0
     return Advice(action, detail, radius, gain)
+
+
+def _moment(stamp_ns: int) -> str:
+    """Time of day with hundredths, which tells an image from the next one; the date is that of the recording."""
+    text = utc(stamp_ns)
+    if not text.endswith(" UTC"):
+        return text
+    return f"{text.split()[1]}.{stamp_ns // 10_000_000 % 100:02d} UTC"
 
 
 def _ranked(point: PointEstimate, told: list[Advice]) -> tuple[Advice, ...]:

@@ -48,7 +48,9 @@ def clicked_views(scene: Surroundings, point_id: str) -> list[Clicked]:
     for where, pick in scene.engine.pipes.clicked:
         if pick.point_id == point_id:
             pose = scene.values.atPose3(where.key)
-            o_T_c = pose if pick.camera == "m_left" else pose.compose(scene.values.atPose3(keys.extrinsics(pick.camera)))
+            o_T_c = (
+                pose if pick.camera == "m_left" else pose.compose(scene.values.atPose3(keys.extrinsics(pick.camera)))
+            )
             found[pick.camera, pick.stamp_ns] = Clicked(pick.camera, pick.stamp_ns, where.key, o_T_c)
     return sorted(found.values(), key=lambda c: (-c.stamp_ns, c.camera))
 
@@ -81,9 +83,7 @@ class Places:
         axis = self._axis(known.pipe) if known.on_axis else middle.o_T_c.rotation().matrix()[:, 1]
         for turn in TURNS_DEG:
             for sign in (1.0, -1.0):
-                eye = o_p + gtsam.Rot3.AxisAngle(axis, np.radians(sign * turn)).rotate(
-                    middle.o_T_c.translation() - o_p
-                )
+                eye = o_p + gtsam.Rot3.AxisAngle(axis, np.radians(sign * turn)).rotate(middle.o_T_c.translation() - o_p)
                 if min(_apart_deg(eye, c.o_T_c.translation(), o_p) for c in views) < APART_DEG:
                     continue
                 if scene.hidden(eye, o_p, scene.radius_of(known.pipe)):
@@ -92,7 +92,7 @@ class Places:
                 if view is not None:
                     away = float(np.linalg.norm(eye - o_p))
                     beside = _side(middle.o_T_c, eye)
-                    yield Place(view, f"{turn:.0f}° round the pipe {beside}, {away:.1f} m from it")
+                    yield Place(view, f"{turn:.0f}° {beside} round it, {away:.1f} m away")
 
     def _axis(self, pipe: str | None) -> Float:
         i = self._engine.pipes.cylinders[pipe or ""].index
@@ -112,7 +112,7 @@ class Places:
             if keys.keyframe(i) in used or away > 1.5 * furthest or not scene.pixels("m_left", pose, o_p[None])[1][0]:
                 continue
             apart = min((_apart_deg(pose.translation(), c.o_T_c.translation(), o_p) for c in views), default=90.0)
-            text = f"{apart:.0f}° beside the nearest clicked view"
+            text = f"{apart:.0f}° from the clicks"
             found.append((apart, Place(View(keys.keyframe(i), pose), text), stamp_ns))
         found.sort(key=lambda f: -f[0])
         clear = (f for f in found if not scene.hidden(f[1].view.o_T_m.translation(), o_p, scene.radius_of(known.pipe)))
@@ -134,17 +134,16 @@ class Places:
                     continue
                 view = self._new(pose)
                 if view is not None:
-                    yield Place(
-                        view, f"from {distance:.1f} m, {BOARD_TILT_DEG:.0f}° to the {name} side of the page, board whole "
-                        "in both images, surroundings in view"
-                    )  # fmt: skip
+                    yield Place(view, f"from {distance:.1f} m, {BOARD_TILT_DEG:.0f}° from its {name} side")
                 break
 
     def between(self, o_T_rgb: gtsam.Pose3) -> tuple[View, gtsam.Pose3, str] | None:
         """A place for a further board that the Kinect's colour camera and a keyframe's place both look at."""
         scene = self._scene
         count = len(self._engine.odometry.keyframe_stamps)
-        eyes = [scene.values.atPose3(keys.keyframe(i)) for i in range(0, count, max(1, count // PLACES_PER_SECOND_BOARD))]
+        eyes = [
+            scene.values.atPose3(keys.keyframe(i)) for i in range(0, count, max(1, count // PLACES_PER_SECOND_BOARD))
+        ]
         options = []
         for x in (0.0, -0.35, 0.35):
             for z in (1.2, 1.6):
@@ -163,7 +162,7 @@ class Places:
                 facing = look_at(spot + middle, spot, o_T_rgb.rotation().matrix()[:, 1])
                 # The page's x points right, y up and z out of it, to those who look at it.
                 page = gtsam.Rot3(facing.rotation().matrix() @ np.diag([1.0, -1.0, -1.0]))
-                return view, gtsam.Pose3(page, spot), f"{z:.1f} m before the Kinect, turned halfway to the mobile camera"
+                return view, gtsam.Pose3(page, spot), f"{z:.1f} m before the Kinect, turned halfway"
         return None
 
 

@@ -99,7 +99,9 @@ class Surroundings:
         c_p = (points - o_T_c.translation()) @ o_T_c.rotation().matrix()
         model = self.engine.cameras[camera]
         front = c_p[:, 2] > 0.5 * NEAREST_M
-        px = (c_p @ self.values.atCal3DS2(keys.intrinsics(camera)).K().T)[:, :2] / np.where(front, c_p[:, 2], 1)[:, None]
+        px = (c_p @ self.values.atCal3DS2(keys.intrinsics(camera)).K().T)[:, :2] / np.where(front, c_p[:, 2], 1)[
+            :, None
+        ]
         size = np.array([model.width, model.height])
         return px, front & ((px > MARGIN_PX) & (px < size - 1 - MARGIN_PX)).all(1)
 

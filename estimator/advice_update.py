@@ -7,8 +7,7 @@ from typing import Self
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, diags
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_matrix, diags
 
 from .linear import LinearSystem
 
@@ -54,7 +53,7 @@ class Joint:
         """The joint of some variables of the graph as it is."""
         columns, X = _solved(system, keys)
         selected = np.concatenate([np.arange(system.parameters)[system.columns[key]] for key in keys])
-        middle = csc_matrix(system.A.T @ diags(system.inflation) @ system.A)
+        middle = csr_matrix(system.A.T @ diags(system.inflation) @ system.A)
         weight = X[selected]
         return cls(columns, 0.5 * (weight + weight.T), X.T @ (middle @ X))
 
@@ -139,15 +138,18 @@ def _left_null_space(N: Float) -> Float:
     return vectors[:, rank:].T
 
 
-def reweighted(system: LinearSystem, weights: Float, blocks: Blocks) -> Float:
-    """Covariance of `J x` if rows carried `weights` times their information, their errors being as much smaller.
+def measured_again(system: LinearSystem, rows: NDArray[np.bool_], times: float, blocks: Blocks) -> Float:
+    """Covariance of `J x` if some rows of the graph had been measured `times` as often, with independent errors.
 
     Args:
-        weights: shape (rows,), 1 where nothing changes.
+        rows: shape (rows of the system,).
     """
-    A = diags(np.sqrt(weights)) @ system.A
-    factor = splu(
-        csc_matrix(A.T @ A), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-    )
-    influence = np.sqrt(system.inflation)[:, None] * (A @ factor.solve(np.ascontiguousarray(system.selector(blocks))))
-    return influence.T @ influence
+    J = system.selector(blocks)
+    W = np.sqrt(times - 1.0) * system.A[rows].toarray()
+    right = np.hstack([J, W.T])
+    X = system.solve(right)
+    middle = csr_matrix(system.A.T @ diags(system.inflation) @ system.A)
+    joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, X.T @ (middle @ X))
+    select = np.hstack([np.zeros((len(W), J.shape[1])), np.eye(len(W))])
+    after = joint.with_rows(Rows(select, np.diag(system.inflation[rows])))
+    return after.covariance[: J.shape[1], : J.shape[1]]

@@ -38,7 +38,8 @@ def pick_views(engine: Engine, values: gtsam.Values, system: LinearSystem) -> tu
                     break
                 kept.append((index, where, pick))
     return tuple(
-        _view(engine, values, system, where, pick) for _, where, pick in sorted(kept, key=lambda k: (k[0], -k[2].stamp_ns))
+        _view(engine, values, system, where, pick)
+        for _, where, pick in sorted(kept, key=lambda k: (k[0], -k[2].stamp_ns))
     )
 
 
@@ -84,9 +85,7 @@ def _view(engine: Engine, values: gtsam.Values, system: LinearSystem, where: See
     )
 
 
-def seen_pixel(
-    values: gtsam.Values, system: LinearSystem, camera: str, pose: int, point: int
-) -> tuple[Float, Float]:
+def seen_pixel(values: gtsam.Values, system: LinearSystem, camera: str, pose: int, point: int) -> tuple[Float, Float]:
     """Where the estimated point lies in an image (ideal pixels, shape (2,)), and its covariance (2, 2).
 
     The covariance is of the joint of camera pose, point and calibration.

@@ -1,4 +1,4 @@
-"""The mapped surroundings in {b}: a compact map for the result, and the surface next to a point that is not its pipe."""
+"""The mapped surroundings in {b}: a compact map for the result, and what is next to a point that is not its pipe."""
 
 from dataclasses import dataclass
 
@@ -158,7 +158,13 @@ def _in_company(points: Float, other: Bool) -> Bool:
 
 
 def _distance_sigma(
-    found: Surroundings, row: int, unit: Float, point: PointEstimate, key: int, values: gtsam.Values, system: LinearSystem
+    found: Surroundings,
+    row: int,
+    unit: Float,
+    point: PointEstimate,
+    key: int,
+    values: gtsam.Values,
+    system: LinearSystem,
 ) -> float:
     """Sigma of the distance from the joint of the point and what is next to it."""
     if row < len(found.landmarks):

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from ..factors.errors import SurecutError
 
 LARGEST_PX = 240
+SMALLEST_PX = 120
+SHARE = 3
+"""A cut-out shows so much of the image's width: enough to know the place, and each pixel of the click still shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +23,8 @@ class CutOut:
     """Column and row of its first pixel in the whole image."""
 
 
-def cut_out(image: NDArray[np.uint8], px: NDArray[np.float64], largest_px: int = LARGEST_PX) -> CutOut:
-    """The neighbourhood of a pixel, at most `largest_px` wide and high, as grey PNG.
+def cut_out(image: NDArray[np.uint8], px: NDArray[np.float64]) -> CutOut:
+    """The neighbourhood of a pixel, 120 to 240 pixels wide and high (less where the image is smaller), as grey PNG.
 
     Args:
         image: shape (height, width) or (height, width, 3), the latter BGR.
@@ -33,7 +36,8 @@ def cut_out(image: NDArray[np.uint8], px: NDArray[np.float64], largest_px: int =
     if image.size == 0:
         raise SurecutError("the image under a pick is empty; record images of the camera")
     height, width = image.shape[:2]
-    size = min(largest_px, width), min(largest_px, height)
+    side = int(np.clip(width // SHARE, SMALLEST_PX, LARGEST_PX))
+    size = min(side, width), min(side, height)
     column = int(np.clip(round(float(px[0])) - size[0] // 2, 0, width - size[0]))
     row = int(np.clip(round(float(px[1])) - size[1] // 2, 0, height - size[1]))
     part = image[row : row + size[1], column : column + size[0]]

@@ -15,9 +15,7 @@ def ply_bytes(points_m: Float32, colours: UInt8, sigma_m: Float32) -> bytes:
         colours: shape (n, 3), red, green, blue.
         sigma_m: shape (n,), written as a property of its own, which programs that do not know it skip.
     """
-    table = np.empty(
-        len(points_m), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "u1", (3,)), ("sigma", "<f4")]
-    )
+    table = np.empty(len(points_m), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "u1", (3,)), ("sigma", "<f4")])
     for i, axis in enumerate("xyz"):
         table[axis] = points_m[:, i]
     table["rgb"], table["sigma"] = colours, sigma_m

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from surecut.estimator.advice_update import Joint, Predicted, Rows, reweighted
+from surecut.estimator.advice_update import Joint, Predicted, Rows, measured_again
 from surecut.estimator.linear import LinearSystem
 from surecut.factors.noise import sigmas
 
@@ -94,11 +94,11 @@ def test_no_rows_change_nothing():
     assert joint.with_rows(Rows(np.zeros((0, 1)), np.zeros((0, 0)))) is joint
 
 
-def test_reweighting_equals_rebuilding():
+def test_measuring_rows_again_equals_rebuilding():
     """Four times the information in a row is half the sigma."""
     before, _ = system_of([scalar_prior(1, 0.5), difference(1, 2, 2.0)], [1, 2])
     after, _ = system_of([scalar_prior(1, 0.5), difference(1, 2, 1.0)], [1, 2])
     J = np.array([[1.0]])
-    got = reweighted(before, np.array([1.0, 4.0]), [(2, J)])
+    got = measured_again(before, np.array([False, True]), 4.0, [(2, J)])
     np.testing.assert_allclose(got, after.covariance([(2, J)]))
     assert got[0, 0] == pytest.approx(1.25)

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ..covariance import larger
+
 Float = NDArray[np.float64]
 
 _STRETCH_PX = 5.0
@@ -187,7 +189,7 @@ def _gather(
     inside = float(np.clip(0.8 * half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
     along = (px - foot_px) @ np.array([-line[1], line[0]])
-    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
+    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey + depth)
     grey, depth, along = grey[keep], depth[keep], along[keep]
     number = max(1, round((span[1] - span[0]) / _STRETCH_PX))
     stretch = np.minimum(((along - span[0]) / (span[1] - span[0]) * number).astype(int), number - 1)
@@ -202,7 +204,9 @@ def _gather(
         table[i, stretch[order], place] = values[order]
     table = table[:, full]
     noise = max(noise, 0.3)
-    return _Pixels(*table, half_width_px, noise, noise / _stains(*table, inside))
+    values, depths, places, weight = table
+    evenness = noise / _stains(values, depths, places, weight, inside)
+    return _Pixels(values, depths, places, weight, half_width_px, noise, evenness)
 
 
 def _stains(grey: Float, depth: Float, along: Float, weight: Float, inside: float) -> float:
@@ -310,15 +314,7 @@ def _covariance(linear: _Linear, weights: Float) -> Float:
     inverse = np.linalg.inv(normal)
     effective = weights.sum() ** 2 / (weights**2).sum()
     sandwich = inverse @ (scores.T @ scores) @ inverse * effective / max(effective - 2.0, 0.5)
-    return _larger(inverse[:2, :2], sandwich[:2, :2])
-
-
-def _larger(a: Float, b: Float) -> Float:
-    """A covariance that is no smaller than either in any direction."""
-    root = np.linalg.cholesky(a)
-    inner = np.linalg.solve(root, np.linalg.solve(root, b).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
+    return larger(np.asarray(inverse[:2, :2], np.float64), sandwich[:2, :2])
 
 
 def _result(line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float) -> EdgeFit | None:

@@ -1,14 +1,15 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, OutlineSighting, Rejection
-from ..rays import ideal_from_raw, pixel_rays, raw_from_ideal
+from ..rays import ideal_grid
+from ..undistort import distort, undistort
 from .edges import EdgeLine, image_noise, straight_lines
 from .limb import EdgeFit, fit_edge
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
@@ -25,7 +26,7 @@ class OutlineConfig:
     reach_px: float = 80.0
     """Edges are followed so far from the centre."""
     click_sigma_px: float = 1.5
-    limits: PairLimits = PairLimits()
+    limits: PairLimits = field(default_factory=PairLimits)
     refined_pairs: int = 7
     """Hypotheses that get the sub-pixel fit."""
     lowest_quality: float = 0.8
@@ -62,10 +63,11 @@ class OutlineFinder:
     def __init__(self, camera: CameraModel, config: OutlineConfig | None = None) -> None:
         self._camera = camera
         self._config = config or OutlineConfig()
-        self._ideal = pixel_rays(camera) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        self._ideal = ideal_grid(camera)
 
     def near_pick(
-        self, stamp_ns: int, pipe_id: str, image: Grey, pick_px: Float, expected_radius_px: tuple[float, float] | None = None,
+        self, stamp_ns: int, pipe_id: str, image: Grey, pick_px: Float,
+        expected_radius_px: tuple[float, float] | None = None,
         axis_hint_px: Float | None = None,
     ) -> OutlineSighting | Rejection:  # fmt: skip
         """The outline about an operator's pick.
@@ -120,7 +122,7 @@ class OutlineFinder:
         half = int(np.ceil(1.5 * self._config.reach_px))
         corner = np.floor(centre) - half
         grid = np.stack(np.meshgrid(*(np.arange(2 * half + 2, dtype=float),) * 2), axis=2) + corner
-        raw = raw_from_ideal(grid.reshape(-1, 2), self._camera).reshape(grid.shape)
+        raw = distort(self._camera, grid)
         patch = sampled(image.astype(np.float32), raw)
         return patch, centre - corner
 
@@ -242,7 +244,8 @@ class OutlineFinder:
         )
         # An edge that is not sure lies somewhere between the pipe's middle and as far outside.
         anywhere = np.diag([(0.5 * best.pair.width_px) ** 2, 0.1])
-        covariance = np.array([fit.covariance if good else anywhere for fit, good in zip(best.fits, sure, strict=True)])
+        known = zip(best.fits, sure, strict=True)
+        covariance = np.array([fit.covariance if good else anywhere for fit, good in known])
         return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
 
     @property
@@ -305,5 +308,5 @@ def silhouette_sighting(
     pipe_id: str = "pipe0",
 ) -> OutlineSighting | Rejection:
     """The outline about one pick in one image; see `OutlineFinder.near_pick`. With `raw` the pick is a raw pixel."""
-    pick = ideal_from_raw(pick_px[None], camera)[0] if raw else pick_px
+    pick = undistort(camera, pick_px)[0] if raw else pick_px
     return OutlineFinder(camera).near_pick(stamp_ns, pipe_id, image, pick, expected_radius_px, axis_hint_px)

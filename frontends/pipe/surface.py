@@ -98,7 +98,9 @@ def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, ha
     strips = strips[np.isfinite(strips).mean(axis=1) > 0.99]
     if len(strips) < len(place):
         return 0.0
-    smooth = strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
+    smooth = (
+        strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
+    )
     variance = np.array([_flat(strip).var() for strip in smooth]) + 0.5
     inside = _signed(lines, core_px, place, across)
     pipe = float(np.median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)]))
@@ -135,7 +137,9 @@ def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) 
     strips = sampled(patch, centre + place[:, None, None] * across + along[:, None] * axis)
     smooth = strips[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2).astype(float)
     known = np.isfinite(smooth).all(axis=1)
-    variance = np.array([_flat(strip).var() if good else np.nan for strip, good in zip(smooth, known, strict=True)]) + 0.5
+    variance = (
+        np.array([_flat(strip).var() if good else np.nan for strip, good in zip(smooth, known, strict=True)]) + 0.5
+    )
     core = variance[(np.abs(place) <= 3.0) & known]
     if len(core) < 4:
         return []
