@@ -9,9 +9,11 @@ from ..factors.board import mean_point
 from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
+from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .batch import BatchSolution
+from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .correlation import track_inflation
 from .engine import Engine, distance_name
@@ -61,6 +63,7 @@ class Summary:
         consistency = self._consistency()
         points = self._points()
         distances = self._distances(between)
+        self._tell_corner_rms()
         return Result(
             points=points,
             poses=self._poses(),
@@ -78,6 +81,14 @@ class Summary:
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
         )
+
+    def _tell_corner_rms(self) -> None:
+        """Distance of the accepted corners from where the solution puts them."""
+        corners = [f for _, f, r in self._active if r.family == CORNERS and isinstance(f, gtsam.NoiseModelFactor)]
+        if corners:
+            rms = float(np.sqrt(np.mean([np.sum(f.unwhitenedError(self._values) ** 2) for f in corners])))
+            text = f"{len(corners)} marker corners lie {rms:.2f} px (rms) from where the solution puts them"
+            self._engine.events.append(Event(self._engine.end_ns, "corner_rms", text, "info", {"rms_px": rms}))
 
     # Points ---------------------------------------------------------------------------------------------------
 
