@@ -26,6 +26,7 @@ from ..factors.links import gauge_prior, mount_factor, mount_pose
 from ..factors.measurements import Event, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.noise import sigmas
 from ..factors.rig import Distance, Rig
+from ..frontends.pick_image import CutOut
 from .boards import DISTANCES, Boards
 from .bundle import Bundle
 from .graph import Record, State, Update
@@ -59,6 +60,10 @@ class Engine:
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
+        self.picks: list[Pick] = []
+        """All clicks, also those that were refused."""
+        self.pick_images: dict[tuple[str, int, str], CutOut] = {}
+        """What was clicked, by camera, stamp and point id, where there is an image."""
         self.keyframe_at: dict[int, int] = {}
         """Stamp to keyframe index."""
         self._recent: dict[int, tuple[StereoFrame, int, Float]] = {}
@@ -307,6 +312,7 @@ class Engine:
             self._pick(pick, bundle.depths_m.get(pick.point_id))
 
     def _pick(self, pick: Pick, depth_m: tuple[float, float] | None) -> None:
+        self.picks.append(pick)
         where = self.seen_from(pick.camera, pick.stamp_ns)
         if where is None:
             self.open_picks.append((pick, depth_m))

@@ -16,10 +16,11 @@ from ..io.build import (
     pose_with_covariance_stamped,
     tf_message,
 )
-from ..io.build_views import covariance_cloud, diagnostic_array, marker_array_ellipsoids
+from ..io.build_views import covariance_cloud, diagnostic_array, marker_array_ellipsoids, point_cloud2
 from ..io.writer import McapSink
 from .result import PoseEstimate, Result
 from .result_json import to_json
+from .surroundings import map_rows
 
 Float = NDArray[np.float64]
 
@@ -37,6 +38,7 @@ def write_result(path: Path, result: Result) -> None:
     with McapSink(path) as sink:
         _write_poses(sink, result)
         _write_points(sink, result)
+        _write_map(sink, result)
         _write_diagnostics(sink, result)
         sink.attach("result.json", "application/json", to_json(result), result.end_ns)
         sink.attach("rig.yaml", "application/yaml", result.config_yaml, result.end_ns)
@@ -74,6 +76,16 @@ def _write_points(sink: McapSink, result: Result) -> None:
     sink.write("/estimate/points_cloud", "sensor_msgs/msg/PointCloud2", covariance_cloud(stamp, frame, pairs), stamp)
     ellipsoids = marker_array_ellipsoids(stamp, frame, "points", pairs)
     sink.write("/estimate/points_ellipsoids", "visualization_msgs/msg/MarkerArray", ellipsoids, stamp)
+
+
+def _write_map(sink: McapSink, result: Result) -> None:
+    """The surroundings as a cloud with each point's own sigma, for viewers."""
+    if result.surroundings is None:
+        return
+    rows = map_rows(result.surroundings)
+    columns = {name: np.ascontiguousarray(rows[:, i]) for i, name in enumerate(("x", "y", "z", "sigma"))}
+    cloud = point_cloud2(result.end_ns, result.surroundings.frame, columns)
+    sink.write("/estimate/map", "sensor_msgs/msg/PointCloud2", cloud, result.end_ns)
 
 
 def _write_diagnostics(sink: McapSink, result: Result) -> None:

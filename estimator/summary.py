@@ -1,5 +1,7 @@
 """From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,7 @@ from ..factors.geometry import ros_covariance
 from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
+from .advice import advise
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
@@ -21,6 +24,7 @@ from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
 from .odometry import FAMILY as ODOMETRY
+from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
     CalibrationEstimate,
@@ -31,6 +35,7 @@ from .result import (
     PoseEstimate,
     Result,
 )
+from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
 
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
@@ -52,9 +57,9 @@ class Summary:
             graph.add(factor)
         self._system = LinearSystem(graph, solution.values)
         records = [record for _, _, record in self._active]
-        inflation = track_inflation(records, self._system, ODOMETRY)
+        self._inflation = track_inflation(records, self._system, ODOMETRY)
         of_tracks = np.array([r.family == ODOMETRY for r in records])
-        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = inflation
+        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = self._inflation
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -64,11 +69,14 @@ class Summary:
         points = self._points()
         distances = self._distances(between)
         self._tell_corner_rms()
+        pipes = self._pipes(points)
+        around = surroundings(engine, self._values, self._system)
+        points = tuple(self._with_surface(p, pipes, around) for p in points)
         return Result(
             points=points,
             poses=self._poses(),
             trajectory=self._trajectory(),
-            pipes=self._pipes(points),
+            pipes=pipes,
             calibration=self._calibration(),
             distances=distances,
             consistency=consistency,
@@ -80,6 +88,10 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
+            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            pick_views=pick_views(engine, self._values, self._system),
+            picks=pick_records(engine),
+            surroundings=compact_map(around),
         )
 
     def _tell_corner_rms(self) -> None:
@@ -119,6 +131,16 @@ class Summary:
             pipe_id=point.pipe if point.on_axis else None,
             budget=self._budget(influence),
         )
+
+    def _with_surface(
+        self, point: PointEstimate, pipes: tuple[PipeEstimate, ...], around: Surroundings | None
+    ) -> PointEstimate:
+        """What is next to a point on a pipe. Without a pipe the map cannot be told from what is to be cut."""
+        own = next((pipe for pipe in pipes if pipe.id == point.pipe_id), None)
+        if own is None or around is None:
+            return point
+        key = keys.point(self._engine.pipes.points[point.id].index)
+        return replace(point, nearest_surface=nearest_surface(around, point, own, key, self._values, self._system))
 
     def _axis(self, index: int) -> Float:
         o_T_b = self._values.atPose3(keys.base(0))

@@ -1,5 +1,7 @@
 """Estimate pipe points in {b}, poses and calibration from recorded logs, jointly and with covariances."""
 
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +46,8 @@ class Job:
     between: tuple[tuple[str, str], ...]
     frame: Literal["o", "world"]
     """Of the trajectory in TUM format."""
+    command: str = ""
+    """As the user typed it."""
 
 
 def command(
@@ -102,7 +106,9 @@ def _job(
             return None
         return target / f"{log.stem}{suffix}" if several or target.is_dir() else target
 
-    return Job(log, place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"), between, frame)
+    typed = shlex.join(["surecut", *sys.argv[1:]])
+    places = (place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"))
+    return Job(log, *places, between, frame, typed)
 
 
 def _done(job: Job) -> bool:
@@ -121,7 +127,7 @@ def _done(job: Job) -> bool:
 
 def run_job(job: Job) -> str:
     """One log; returns one line. Top level, so that processes and clusters can take it."""
-    result = optimise(job.log, job.rig, job.between)
+    result = optimise(job.log, job.rig, job.between, command=job.command)
     _write(job, result)
     radius = max((p.radius95_m for p in result.points), default=float("nan"))
     state = "consistent" if result.consistency.passed else "INCONSISTENT"
@@ -158,7 +164,7 @@ def _with_progress(job: Job) -> Result:
         def advance(stamp_ns: int) -> None:
             bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
-        result = optimise(job.log, job.rig, job.between, advance)
+        result = optimise(job.log, job.rig, job.between, advance, job.command)
     _write(job, result)
     return result
 
