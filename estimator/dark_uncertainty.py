@@ -33,7 +33,8 @@ def missing_variance(errors: Float, variances: Float) -> float:
 
     if len(errors) == 0 or excess(0.0) <= 0.0:
         return 0.0
-    return float(brentq(excess, 0.0, float(np.sum(errors**2)), xtol=1e-18, rtol=1e-10))
+    root = brentq(excess, 0.0, float(np.sum(errors**2)), xtol=1e-18)
+    return float(root)  # pyright: ignore[reportArgumentType]  # without full_output it is a number
 
 
 def left_out(system: LinearSystem, positions: Sequence[int], sigmas: Float) -> tuple[Float, Float]:

@@ -11,10 +11,12 @@ from ..factors.board import mean_point
 from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
+from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
 from .batch import BatchSolution
+from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .correlation import track_inflation
 from .engine import Engine, distance_name
@@ -66,6 +68,7 @@ class Summary:
         consistency = self._consistency()
         points = self._points()
         distances = self._distances(between)
+        self._tell_corner_rms()
         pipes = self._pipes(points)
         around = surroundings(engine, self._values, self._system)
         points = tuple(self._with_surface(p, pipes, around) for p in points)
@@ -90,6 +93,14 @@ class Summary:
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _tell_corner_rms(self) -> None:
+        """Distance of the accepted corners from where the solution puts them."""
+        corners = [f for _, f, r in self._active if r.family == CORNERS and isinstance(f, gtsam.NoiseModelFactor)]
+        if corners:
+            rms = float(np.sqrt(np.mean([np.sum(f.unwhitenedError(self._values) ** 2) for f in corners])))
+            text = f"{len(corners)} marker corners lie {rms:.2f} px (rms) from where the solution puts them"
+            self._engine.events.append(Event(self._engine.end_ns, "corner_rms", text, "info", {"rms_px": rms}))
 
     # Points ---------------------------------------------------------------------------------------------------
 

@@ -71,7 +71,7 @@ def told(result, kind):
 
 def test_a_sound_log_is_answered(run, tmp_path):
     result = run(cell.write(tmp_path / "run.mcap")).finds_the_point()
-    assert not result["events"]
+    assert [event["kind"] for event in result["events"]] == ["corner_rms"]
 
 
 # The file ---------------------------------------------------------------------------------------------------------
