@@ -159,7 +159,7 @@ class Planner:
         view, o_T_f, text = place
         new = gtsam.Values()
         found = factors.second_board(scene, new, rig.boards[0], o_T_f, view)
-        action = "Add a second board that both see"
+        action = "Add a board that both cameras see"
         detail = text
         yield Plan("second board", action, detail, [*factors.ties(scene, view, self._inflation), *found], None, new)
 

@@ -134,7 +134,7 @@ class Places:
                     continue
                 view = self._new(pose)
                 if view is not None:
-                    yield Place(view, f"from {distance:.1f} m, {BOARD_TILT_DEG:.0f}° from its {name} side")
+                    yield Place(view, f"from {distance:.1f} m, {BOARD_TILT_DEG:.0f}° off, to its {name} side")
                 break
 
     def between(self, o_T_rgb: gtsam.Pose3) -> tuple[View, gtsam.Pose3, str] | None:
@@ -162,7 +162,7 @@ class Places:
                 facing = look_at(spot + middle, spot, o_T_rgb.rotation().matrix()[:, 1])
                 # The page's x points right, y up and z out of it, to those who look at it.
                 page = gtsam.Rot3(facing.rotation().matrix() @ np.diag([1.0, -1.0, -1.0]))
-                return view, gtsam.Pose3(page, spot), f"{z:.1f} m before the Kinect, turned halfway"
+                return view, gtsam.Pose3(page, spot), f"{z:.1f} m before the Kinect, halfway to the camera"
         return None
 
 

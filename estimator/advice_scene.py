@@ -167,7 +167,8 @@ def _typical_sigmas(active: Active) -> dict[tuple[str, str], float]:
             continue
         model = factor.noiseModel()  # type: ignore[attr-defined]
         model = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
-        found[record.family, record.camera].append(float(np.sqrt(np.trace(model.covariance()) / 2)))
+        if isinstance(model, gtsam.noiseModel.Gaussian):
+            found[record.family, record.camera].append(float(np.sqrt(np.trace(model.covariance()) / 2)))
     return {kind: float(np.median(sigmas)) for kind, sigmas in found.items()}
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..factors import keys
 from ..factors.cloud import corrected
@@ -152,7 +152,7 @@ def _in_company(points: Float, other: Bool) -> Bool:
     company = np.zeros(len(points), bool)
     rows = np.flatnonzero(other)
     if len(rows) > 1:
-        apart, _ = cKDTree(points[rows]).query(points[rows], k=2)
+        apart, _ = KDTree(points[rows]).query(points[rows], k=2)
         company[rows] = apart[:, 1] < NEIGHBOUR_M
     return company
 
