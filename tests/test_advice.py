@@ -12,7 +12,8 @@ import pytest
 from surecut.estimator.advice_places import Places
 from surecut.estimator.advice_scene import Surroundings
 from surecut.estimator.batch import solve
-from surecut.estimator.engine import Engine, bundles
+from surecut.estimator.bundle import bundles
+from surecut.estimator.engine import Engine
 from surecut.estimator.run import SETTLE_ROUNDS, estimate
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors.measurements import Pick
