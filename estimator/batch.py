@@ -10,7 +10,8 @@ from ..factors import keys
 from ..factors.measurements import Rejection
 from ..factors.noise import huber_norm, robust_scale
 from .graph import FactorLog, Record
-from .linear import LinearSystem
+from .linear import LinearSystem, deviate
+from .observability import determined
 
 Float = NDArray[np.float64]
 
@@ -64,7 +65,8 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[g
     parameters.setMaxIterations(40)
     parameters.setlambdaInitial(1e-8)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
-    values = optimiser.optimize()
+    with determined():
+        values = optimiser.optimize()
     return values, optimiser.iterations()
 
 
@@ -145,15 +147,17 @@ def snooped(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[
     family and round, because one wrong measurement makes its neighbours look wrong.
     """
     active = [(i, f, r) for i, f, r in log.active() if i not in off]
+    positions = [i for i, (_, _, r) in enumerate(active) if r.rejectable and r.family in SNOOPED]
+    if not positions:
+        return []
     graph = gtsam.NonlinearFactorGraph()
     for _, factor, _ in active:
         graph.add(factor)
     system = LinearSystem(graph, values)
     worst: dict[str, tuple[float, int, Rejection]] = {}
-    for position, (index, _, record) in enumerate(active):
-        if not record.rejectable or record.family not in SNOOPED:
-            continue
-        sigma = system.standardised(position)
+    for position, (total, dof) in zip(positions, system.standardised(positions), strict=True):
+        index, _, record = active[position]
+        sigma = deviate(total, dof) if dof else 0.0
         if sigma > SNOOPING_SIGMA and sigma > worst.get(record.family, (0.0,))[0]:
             told = Rejection(
                 record.stamp_ns, record.family, record.what, "off the rest by sigmas", sigma, SNOOPING_SIGMA

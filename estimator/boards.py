@@ -17,6 +17,7 @@ from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Board, Marker, Rig
 from ..frontends.resection import PlanarPose, page_pose_and_side, planar_poses
 from .graph import Record, State, Update
+from .view_cells import ViewCells
 
 Float = NDArray[np.float64]
 
@@ -60,7 +61,7 @@ class Boards:
         self._sheets = {board.id: _Sheet(i, board) for i, board in enumerate(rig.boards)}
         self._markers = {(b.id, m.id): m for b in rig.boards for m in b.markers}
         self._next_slot = 0
-        self._cells: dict[tuple[str, str], list[tuple[gtsam.Pose3, int]]] = {}
+        self._cells: dict[tuple[str, str], ViewCells] = {}
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
 
@@ -360,20 +361,13 @@ class Boards:
         Views are counted per cell of viewing position; the n-th view of a cell gets n times the common variance, so
         that standing still gives no more than one view's worth of it.
         """
-        common = self._rig.noise.marker_common_px
-        key = (sheet.board.id, sighting.camera)
-        held = update.values.exists(keyframe)
-        pose = update.values.atPose3(keyframe) if held else self._state.pose(keyframe)
-        board = update.values.atPose3(sheet.key) if update.values.exists(sheet.key) else self._state.pose(sheet.key)
-        view = board.between(pose)
-        cells = self._cells.setdefault(key, [])
-        for i, (other, count) in enumerate(cells):
-            if _same_view(view, other):
-                views = count + (1 if sighting.marker == min(sheet.slots, default=sighting.marker) else 0)
-                cells[i] = (other, views)
-                return sighting.covariance_px2 + np.eye(2) * common**2 * max(count, 1)
-        cells.append((view, 1))
-        return sighting.covariance_px2 + np.eye(2) * common**2
+        cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
+        if cells.last != keyframe:
+            held = update.values.exists(keyframe)
+            pose = update.values.atPose3(keyframe) if held else self._state.pose(keyframe)
+            board = update.values.atPose3(sheet.key) if update.values.exists(sheet.key) else self._state.pose(sheet.key)
+            cells.count(keyframe, board.between(pose).matrix())
+        return sighting.covariance_px2 + np.eye(2) * self._rig.noise.marker_common_px**2 * cells.views
 
     def slot_of(self, board: str, marker: int) -> int | None:
         """The corner slot of a marker, None before it was seen."""
@@ -397,12 +391,3 @@ class Boards:
 
     def _say(self, stamp_ns: int, kind: str, text: str, severity: str, **values: float) -> None:
         self.events.append(Event(stamp_ns, kind, text, severity, values))  # type: ignore[arg-type]
-
-
-def _same_view(a: gtsam.Pose3, b: gtsam.Pose3) -> bool:
-    """Two views of a board that share their sub-pixel error: less than 2 cm and 2 degrees apart."""
-    difference = a.between(b)
-    return bool(
-        np.linalg.norm(difference.translation()) < 0.02
-        and np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())) < 0.035
-    )

@@ -33,11 +33,16 @@ from .boards import DISTANCES, Boards
 from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
+from .observability import why_no_base
 from .odometry import FramePose, Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .surfaces import Associator, Surfaces, SurfaceSettings
 
 Float = NDArray[np.float64]
+
+MARKER_KEYFRAMES = 10
+"""Keyframes of markers alone that share an update: each stands on known boards already, and every update touches the
+corners of all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +81,10 @@ class Engine:
         self._waiting: list[Bundle] = []
         self._forced = False
         self._pending = Update()
+        self.open_picks: list[tuple[Pick, tuple[float, float] | None]] = []
+        """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
+        self._unsolved = 0
+        """Keyframes since the last update."""
         self.end_ns = 0
 
     # The loop -------------------------------------------------------------------------------------------------
@@ -90,16 +99,18 @@ class Engine:
             self._insert_keyframe(bundle)
         if bundle.cloud is not None:
             self.surfaces.see(bundle.cloud)
-        for pick in bundle.picks:
-            self._pick(pick, bundle.depths_m.get(pick.point_id))
+        if not self._waits(bundle):
+            self._picks_of(bundle)
         for outline in bundle.outlines:
             self.add_outline(outline)
-        return self.flush()
+        urgent = bundle.frame is not None or bundle.picks or bundle.outlines or bundle.cloud is not None
+        return self.flush() if urgent or self._unsolved >= MARKER_KEYFRAMES else False
 
     def flush(self) -> bool:
         """One iSAM2 update with what has gathered."""
         if self._pending.empty():
             return False
+        self._unsolved = 0
         update, self._pending = self._pending, Update()
         self.state.values = self.solver.update(update)
         return True
@@ -173,8 +184,10 @@ class Engine:
         self._see_boards(keys.keyframe(index), bundle)
         self._open_base(bundle.stamp_ns)
         self._close_distances(bundle.stamp_ns)
-        self.flush()
-        self._lay_landmarks(index)
+        self._unsolved += 1
+        if bundle.frame is not None:
+            self.flush()
+            self._lay_landmarks(index)
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
@@ -234,16 +247,21 @@ class Engine:
 
     def revisit(self) -> None:
         """Frames that saw no known board get another chance, as long as that makes more boards known."""
-        if self._waiting and not self.odometry.keyframe_stamps:
+        if self._waiting and not self.boards.any_known():
             self._start_from_best()
         while self._waiting:
             before = len(self._waiting)
             waiting, self._waiting = self._waiting, []
             for bundle in waiting:
                 self._insert_keyframe(bundle)
-                self.flush()
+                if not self._waits(bundle):
+                    self._picks_of(bundle)
+                if self._unsolved >= MARKER_KEYFRAMES:
+                    self.flush()
             if len(self._waiting) == before:
                 break
+        self._retry_picks()
+        self.flush()
 
     def _start_from_best(self) -> None:
         """No frame is free of doubt: the one with the least begins."""
@@ -252,7 +270,11 @@ class Engine:
         self._forced = True
         self._insert_keyframe(best)
         self._forced = False
+        self._picks_of(best)
         self.flush()
+
+    def _waits(self, bundle: Bundle) -> bool:
+        return bool(self._waiting) and self._waiting[-1] is bundle
 
     # The machine ----------------------------------------------------------------------------------------------
 
@@ -268,6 +290,7 @@ class Engine:
         what = f"f_T_b of board {mount.board}"
         update.add(mount_factor(mount, board, base), Record("mount", "mount", stamp_ns, what, rejectable=False))
         self._take(update)
+        self._retry_picks()
 
     def _close_distances(self, stamp_ns: int) -> None:
         """Known distances enter when both of their points are in the graph."""
@@ -311,20 +334,37 @@ class Engine:
             return None
         return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
 
+    def _picks_of(self, bundle: Bundle) -> None:
+        for pick in bundle.picks:
+            self._pick(pick, bundle.depths_m.get(pick.point_id))
+
     def _pick(self, pick: Pick, depth_m: tuple[float, float] | None) -> None:
         where = self.seen_from(pick.camera, pick.stamp_ns)
         if where is None:
-            self.rejected.append(
-                Rejection(pick.stamp_ns, "picks", f"pick {pick.point_id}", "no frame of its stamp; frames", 0.0, 1.0)
-            )
-            return
-        self._take(self.pipes.pick(pick, where, depth_m))
+            self.open_picks.append((pick, depth_m))
+        else:
+            self._take(self.pipes.pick(pick, where, depth_m))
+
+    def _retry_picks(self) -> None:
+        """Picks whose camera had no place yet."""
+        waiting, self.open_picks = self.open_picks, []
+        for pick, depth_m in waiting:
+            self._pick(pick, depth_m)
 
     def add_outline(self, outline: OutlineSighting) -> None:
         """Edges of a pipe in a keyframe's image; enters with the next update."""
         where = self.seen_from(outline.camera, outline.stamp_ns)
         if where is not None:
             self._take(self.pipes.outline(outline, where))
+
+    def lost_picks(self) -> list[Pick]:
+        """Picks in cameras that have no place at their stamp."""
+        return [*(p for p, _ in self.open_picks), *(p for b in self._waiting for p in b.picks)]
+
+    def why_no_base(self) -> str:
+        """The missing link between {o} and {b}, in words."""
+        mount = self.rig.mount
+        return why_no_base(mount, mount is not None and self.boards.known(mount.board))
 
     def everything_rejected(self) -> list[Rejection]:
         """All measurements that did not enter, with reasons."""
@@ -338,6 +378,10 @@ class Engine:
                 1.0,
             )
             for b in self._waiting
+        ]
+        waiting += [
+            Rejection(p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0)
+            for p in self.lost_picks()
         ]
         return [
             *self.rejected,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .graph import FactorLog, Update
+from .observability import determined
 
 Float = NDArray[np.float64]
 
@@ -52,7 +53,8 @@ class Incremental:
         for factor in update.factors:
             graph.add(factor)
         removed = [i for i in remove if i not in self.log.off]
-        self._isam.update(graph, update.values, removed)
+        with determined():
+            self._isam.update(graph, update.values, removed)
         self.log.append(update)
         self.log.off.update(removed)
         return self._isam.calculateEstimate()
@@ -61,7 +63,8 @@ class Incremental:
         """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
         empty, none = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for _ in range(rounds):
-            result = self._isam.update(empty, none, force_relinearize=True)
+            with determined():
+                result = self._isam.update(empty, none, force_relinearize=True)
             if result.getVariablesRelinearized() == 0:
                 break
         return self._isam.calculateEstimate()

@@ -1,13 +1,15 @@
 """A recorded log in, the joint estimate out: reads, runs the pipeline, refines, checks what is missing."""
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 
-from ..factors.errors import LogError
+from ..factors.errors import LogError, SurecutError
 from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
+from ..io.ordering import OrderReport
 from ..io.reader import LogReader
 from .pipeline import Pipeline, wanted_topics
 from .result import Result
@@ -28,14 +30,18 @@ def rig_of(log: LogReader, given: Path | None) -> Rig:
         return load_rig(given)
     text = log.attachment("rig.yaml")
     if text is None:
+        next(log.raw(), None)  # what is no recording at all is told first
         raise LogError(f"{log.name}: carries no rig.yaml; give the rig file with --rig (`surecut rig --example`)")
     return load_rig(text, f"{log.name}: rig.yaml")
 
 
 def optimise(
-    log: Path, rig_file: Path | None = None, between: tuple[tuple[str, str], ...] = (), progress: Progress | None = None,
+    log: Path,
+    rig_file: Path | None = None,
+    between: tuple[tuple[str, str], ...] = (),
+    progress: Progress | None = None,
     command: str = "",
-) -> Result:  # fmt: skip
+) -> Result:
     """The joint estimate of one recording.
 
     Args:
@@ -49,13 +55,13 @@ def optimise(
         rig = rig_of(reader, rig_file)
     pipeline = Pipeline(rig)
     reader = LogReader(log, wanted_topics(rig))
-    with watch("run"):
+    with told_of(log, reader), watch("run"):
         for stamp_ns in pipeline.run(reader):
             if progress is not None:
                 progress(stamp_ns)
-    pipeline.check()
+        pipeline.check()
     sha256 = reader.sha256()
-    with watch("refine"):
+    with told_of(log, reader), watch("refine"):
         result = finish(
             pipeline.engine,
             between,
@@ -69,6 +75,40 @@ def optimise(
                 "command": command,
             },
             [*pipeline.sensors.rejected],
-            [Event(pipeline.engine.end_ns, "log_damaged", w, "warning") for w in reader.warnings],
+            [*_damage(reader, pipeline.engine.end_ns), *odd_stamps(pipeline.order, pipeline.engine.end_ns)],
         )
     return result
+
+
+@contextmanager
+def told_of(log: Path, reader: LogReader) -> Iterator[None]:
+    """Errors name the log, and what of it could not be read: that may be why."""
+    try:
+        yield
+    except SurecutError as error:
+        text = str(error)
+        name = "" if str(log) in text else f"{log}: "
+        damage = "".join(f" (the log is damaged: {w})" for w in reader.warnings if w not in text)
+        raise type(error)(f"{name}{text}{damage}") from error
+
+
+def _damage(reader: LogReader, end_ns: int) -> list[Event]:
+    return [Event(end_ns, "log_damaged", warning, "warning") for warning in reader.warnings]
+
+
+def odd_stamps(order: OrderReport, end_ns: int) -> list[Event]:
+    """Stamps that run backwards or stand twice: the messages were sorted and used; whoever recorded should know."""
+    told = []
+    for kind, counts, text in (
+        ("stamps_backwards", order.backwards, "run backwards; the messages were sorted by stamp"),
+        ("stamps_duplicated", order.duplicated, "stand twice"),
+    ):
+        for topic, count in sorted(counts.items()):
+            told.append(Event(end_ns, kind, f"{topic}: {count} stamps {text}", "warning", {"messages": float(count)}))
+    if order.zero:
+        text = f"{order.zero} messages have no stamp; set header.stamp when recording"
+        told.append(Event(end_ns, "stamps_unset", text, "warning", {"messages": float(order.zero)}))
+    if order.late:
+        text = f"{order.late} messages came too late to be sorted and were worked in out of order"
+        told.append(Event(end_ns, "stamps_late", text, "warning", {"messages": float(order.late)}))
+    return told

@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..factors.errors import LogError
+from ..factors.errors import LogError, ObservabilityError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
+from ..frontends.fiducials.messages import UNKNOWN_IDS
 from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import predict_outline
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
@@ -18,6 +19,7 @@ from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .engine import Bundle, Engine
 from .pipes import AXIS_ROLES
 from .sensors import PairImages, Sensors, by_info_topic
+from .sides import Sides
 from .surfaces import Associator, lay_on_surfaces
 
 Item = Message | StereoPair
@@ -27,7 +29,7 @@ KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
 OUTLINE_SPACING_M = 0.05
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.01, 0.05, 0.015)
+OUTLINE_PRIOR = (0.006, 0.02, 0.008)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
@@ -56,6 +58,7 @@ class Pipeline:
         self.engine = Engine(rig, self.sensors.cameras, associate)
         self.order = OrderReport()
         self.pairing = PairingReport()
+        self._sides = Sides(rig)
         self._info = by_info_topic(rig)
         self._kept: deque[PairImages] = deque()
         self._kept_bytes = 0
@@ -127,6 +130,8 @@ class Pipeline:
             camera = self._camera_of(item.topic)
             if isinstance(item.body, DetectionsBody) and camera is not None:
                 found += self.sensors.detections(camera, stamp_ns, item.body)
+        if {"m_left", "m_right"} <= {s.camera for s in found}:
+            self._sides.look(found, self.sensors.cameras, self.sensors.left_T_right())
         return found
 
     def _camera_of(self, topic: str) -> str | None:
@@ -153,7 +158,10 @@ class Pipeline:
 
         Raises:
             LogError: a pick without depth or second view, or on a camera that never delivered.
+            ObservabilityError: a pick in a camera that nothing places.
         """
+        self.engine.revisit()
+        self._check_ids()
         report = self.pairing
         if report.pairs == 0 and report.unpaired and not self.engine.odometry.keyframe_stamps:
             counts = ", ".join(f"{topic} {count}" for topic, count in sorted(report.unpaired.items()))
@@ -164,9 +172,34 @@ class Pipeline:
             if not point.known:
                 pick = point.held[-1][1]
                 raise LogError(
-                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no second "
-                    "view; pick the point again from another place"
+                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no "
+                    "second view; pick the point again from another place"
                 )
+        self._check_open_picks()
+
+    def _check_ids(self) -> None:
+        """Markers were seen, and none of them is on a board."""
+        if self.engine.odometry.keyframe_stamps:
+            return
+        for refused in self.sensors.rejected:
+            if refused.reason.startswith(UNKNOWN_IDS):
+                raise LogError(
+                    f"no known marker was seen: at {refused.stamp_ns} ns {refused.what} are on no board of the rig; "
+                    "correct dictionary and marker ids in the rig file"
+                )
+
+    def _check_open_picks(self) -> None:
+        """A point all of whose picks hang on nothing."""
+        for pick in self.engine.lost_picks():
+            if pick.point_id in self.engine.pipes.points or not self.engine.odometry.keyframe_stamps:
+                continue
+            where = f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {pick.point_id} in {pick.camera}"
+            if pick.camera == "b_rgb":
+                raise ObservabilityError(f"{where}: {self.engine.why_no_base()}")
+            raise LogError(
+                f"{where} has the stamp of no image or markers that could be placed; a pick's header.stamp is that of "
+                "the image it was made in"
+            )
 
     # Outlines -------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,5 @@
 """The front ends of one run: opened when their camera's calibration is known, fed with images, giving measurements."""
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import cast
@@ -21,14 +20,21 @@ from ..frontends.pipe.silhouette import OutlineFinder
 from ..frontends.stereo.frontend import StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
+from .sides import swapped
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 DEPTH_FRAMES = 10
-"""Depth images of a still machine that are averaged before surfaces are read from them."""
+DEPTH_WINDOW_NS = 2_000_000_000
+"""Depth images of a still machine that are averaged before surfaces are read from them: so many, or so long."""
 MATCH_SIGMA_PX = 0.5
 """Disparity error of semi-global matching on a window's median (OpenCV, one pixel steps interpolated to 1/16)."""
+
+ENOUGH_MATCHES = 20
+"""Features in both images of a pair that leave no doubt about which is left."""
+UNMATCHED_PAIRS = 3
+"""Pairs from the start on in which exchanged sides are looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +63,9 @@ class Sensors:
         self._markers: dict[str, MarkerFrontEnd] = {}
         self._outlines: dict[str, OutlineFinder] = {}
         self._clouds: CloudFrontEnd | None = None
-        self._depths: deque[NDArray[np.float32]] = deque(maxlen=DEPTH_FRAMES)
+        self._depths: list[tuple[int, NDArray[np.float32]]] = []
+        self._unmatched = 0
+        """Pairs from the start on that had hardly a feature in common."""
         self.rejected: list[Rejection] = []
 
     def calibrate(self, camera: str, model: CameraModel) -> None:
@@ -75,7 +83,8 @@ class Sensors:
         info = self.rig.cameras.m_right.info_topic
         if baseline < 0 or (baseline == 0 and left > 0):
             raise LogError(
-                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; exchange their topics in the rig file"
+                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; "
+                "exchange their topics in the rig file"
             )
         if baseline == 0:
             raise LogError(f"{info}: no baseline in P[3]; give stereo.m_left_T_m_right in the rig file")
@@ -88,15 +97,35 @@ class Sensors:
             left, right = self._camera("m_left"), self._camera("m_right")
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
-            pose = left_T_right(left, right, self.rig.stereo).matrix()
-            self._stereo = StereoFrontEnd(left, right, pose)
-        return self._stereo.process(pair.stamp_ns, pair.left, pair.right)
+            self._stereo = StereoFrontEnd(left, right, self.left_T_right())
+        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right)
+        if self._unmatched < UNMATCHED_PAIRS:
+            self._check_sides(pair, frame)
+        return frame
+
+    def left_T_right(self) -> Float:
+        """Nominal pose of the right mobile camera in the left one, (4, 4)."""
+        return left_T_right(self._camera("m_left"), self._camera("m_right"), self.rig.stereo).matrix()
+
+    def _check_sides(self, pair: PairImages, frame: StereoFrame) -> None:
+        """The first pairs: where hardly a feature of the left image is in the right one, are they exchanged?"""
+        matches = _matched(frame)
+        if matches >= ENOUGH_MATCHES:
+            self._unmatched = UNMATCHED_PAIRS
+            return
+        self._unmatched += 1
+        other = StereoFrontEnd(self._camera("m_left"), self._camera("m_right"), self.left_T_right())
+        exchanged = _matched(other.process(pair.stamp_ns, pair.right, pair.left))
+        if exchanged >= ENOUGH_MATCHES and exchanged > 4 * matches:
+            evidence = f"at {pair.stamp_ns} ns: {matches} features are in both images, {exchanged} when exchanged"
+            raise swapped(self.rig, evidence)
 
     def _camera(self, name: str) -> CameraModel:
         if name not in self.cameras:
             topic = getattr(self.rig.cameras, name).info_topic
             raise LogError(
-                f"{topic}: no calibration of {name} before its first image; record camera_info or correct the topic in the rig file"
+                f"{topic}: no calibration of {name} before its first image; "
+                "record camera_info or correct the topic in the rig file"
             )
         return self.cameras[name]
 
@@ -105,7 +134,8 @@ class Sensors:
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise LogError(
-                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; record the camera_info that belongs to the images"
+                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; "
+                "record the camera_info that belongs to the images"
             )
 
     def depth_under(self, pick: Pick, pair: PairImages) -> tuple[float, float] | None:
@@ -154,10 +184,10 @@ class Sensors:
             camera = self._camera("b_depth")
             self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)
             self._clouds = CloudFrontEnd(camera, self.rig.kinect.model)
-        self._depths.append(depth_m)
-        if len(self._depths) < DEPTH_FRAMES:
+        self._depths.append((stamp_ns, depth_m))
+        if len(self._depths) < DEPTH_FRAMES and stamp_ns - self._depths[0][0] < DEPTH_WINDOW_NS:
             return None
-        mean = average_depth(np.stack(self._depths))
+        mean = average_depth(np.stack([depth for _, depth in self._depths]))
         count = len(self._depths)
         self._depths.clear()
         return self._clouds.process(stamp_ns, mean, count)
@@ -180,7 +210,8 @@ class Sensors:
         u, v = (float(x) for x in body.px)
         if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
             raise LogError(
-                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of {body.camera}; pick again"
+                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of "
+                f"{body.camera}; pick again"
             )
         if body.role not in ("grasp", "cut", "other"):
             raise LogError(f"{where} has role {body.role!r}; roles are grasp, cut and other")
@@ -199,6 +230,10 @@ class Sensors:
         if camera not in self._outlines:
             self._outlines[camera] = OutlineFinder(self.cameras[camera])
         return self._outlines[camera]
+
+
+def _matched(frame: StereoFrame) -> int:
+    return int(np.isfinite(frame.right_px).all(axis=1).sum())
 
 
 def by_info_topic(rig: Rig) -> Mapping[str, str]:

@@ -12,10 +12,12 @@ from ..factors.geometry import ros_covariance
 from ..factors.rig import dump_rig
 from .batch import BatchSolution
 from .consistency import family_tests, judge, prior_tests
+from .correlation import track_inflation
 from .engine import Engine
 from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
+from .odometry import FAMILY as ODOMETRY
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
     CalibrationEstimate,
@@ -45,8 +47,11 @@ class Summary:
         graph = gtsam.NonlinearFactorGraph()
         for _, factor, _ in self._active:
             graph.add(factor)
-        self._graph = graph
         self._system = LinearSystem(graph, solution.values)
+        records = [record for _, _, record in self._active]
+        inflation = track_inflation(records, self._system, ODOMETRY)
+        of_tracks = np.array([r.family == ODOMETRY for r in records])
+        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = inflation
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -78,7 +83,7 @@ class Summary:
         engine, base = self._engine, keys.base(0)
         known = [p for p in engine.pipes.points.values() if p.known]
         if known and not self._values.exists(base):
-            raise ObservabilityError(why_no_base(engine))
+            raise ObservabilityError(engine.why_no_base())
         return tuple(self._point(p.id) for p in known)
 
     def _point(self, name: str) -> PointEstimate:
@@ -161,9 +166,8 @@ class Summary:
 
     def _keyframe_covariances(self) -> list[Float]:
         """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
-        marginals = gtsam.Marginals(self._graph, self._values)
         count = self._engine.odometry.last_keyframe + 1
-        return [marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
+        return self._system.marginals([keys.keyframe(i) for i in range(count)])
 
     # Calibration and distances --------------------------------------------------------------------------------
 
@@ -313,16 +317,3 @@ class Summary:
             sigma = np.maximum(self._sigmas(key), 1e-12)
             worst[names[kind]] = max(worst.get(names[kind], 0.0), float(np.max(np.abs(delta) / sigma)))
         return worst
-
-
-def why_no_base(engine: Engine) -> str:
-    """The missing link between {o} and {b}, in words."""
-    if engine.rig.mount is None:
-        return "{b} is not observable: the rig has no mount (f_T_b); add the section `mount` to the rig file"
-    board = engine.rig.mount.board
-    if not engine.boards.known(board):
-        return (
-            f"{{b}} is not observable: board {board} was never seen by the mobile camera well enough to be placed; "
-            "record a view of the whole board from 1 to 1.5 m, or correct the marker ids in the rig file"
-        )
-    return "{b} is not observable: nothing ties the Kinect to the mobile camera"

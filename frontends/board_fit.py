@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from ..factors.camera import CameraModel
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Board
 
-Float = NDArray[np.float64]
+Float = NDArray[Any]
 
 UNIT_SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 _STEPS = 30

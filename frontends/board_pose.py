@@ -81,7 +81,7 @@ def apparent_side(
     Pose and side are solved together; the known distances between the centres hold the scale.
 
     Raises:
-        ObservabilityError: fewer than two markers are in view.
+        ObservabilityError: fewer than two markers are in view, or no pose fits them.
     """
     if len({s.marker for s in sightings}) < 2:
         raise ObservabilityError(
@@ -89,13 +89,15 @@ def apparent_side(
         )
     corners = board_corners(sightings, board, common_px)
     best: BoardFit | None = None
+    best_side = board.side_m
     for factor in _SIDE_FACTORS:
         side = float(board.side_m * factor)
         for start in _planar_poses(corners, camera, side):
             fit = fit_board(corners, camera, start, side)
             if best is None or fit.chi2 < best.chi2:
                 best, best_side = fit, side
-    assert best is not None
+    if best is None:
+        raise ObservabilityError(f"board {board.id}: its markers in view allow no pose in front of the camera")
     free = fit_board(corners, camera, best.camera_T_f, best_side, side_free=True)
     scale = max(1.0, free.chi2 / max(free.dof, 1))
     return float(free.extra[0]), float(np.sqrt(free.covariance[6, 6] * scale))

@@ -10,6 +10,8 @@ from scipy.optimize import OptimizeResult, least_squares
 Float = NDArray[np.float64]
 
 MINIMUM_POINTS = 6
+SAME_POSE_RAD = 0.01
+"""Two refined poses of a plane that are turned by less than this are one and the same minimum."""
 
 
 def camera_pose(points_m: Float, px: Float, K: Float, guess: Float | None = None) -> tuple[Float, float] | None:
@@ -84,7 +86,17 @@ def planar_poses(plane_m: Float, px: Float, K: Float) -> list[PlanarPose]:
         residual = _project(matrix, plane_m, K) - px
         if np.isfinite(residual).all():
             poses.append(PlanarPose(matrix, float(np.sqrt((residual**2).sum(1).mean()))))
-    return sorted(poses, key=lambda pose: pose.rms_px)
+    return _distinct(sorted(poses, key=lambda pose: pose.rms_px))
+
+
+def _distinct(poses: list[PlanarPose]) -> list[PlanarPose]:
+    """Without those that refinement has led into the minimum of a better one."""
+    kept: list[PlanarPose] = []
+    for pose in poses:
+        turns = [cv2.Rodrigues(other.camera_T_plane[:3, :3].T @ pose.camera_T_plane[:3, :3])[0] for other in kept]
+        if all(np.linalg.norm(turn) > SAME_POSE_RAD for turn in turns):
+            kept.append(pose)
+    return kept
 
 
 def page_pose_and_side(

@@ -1,6 +1,7 @@
 """Pictures of marker boards with exact truth: a supersampled page, blurred, shaded, with noise."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ from ..factors.rig import Board
 from ..frontends.fiducials.dictionaries import marker_dictionary
 from ..frontends.undistort import undistort
 
-Float = NDArray[np.float64]
+Float = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)

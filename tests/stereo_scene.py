@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+
 from surecut.factors.camera import CameraModel
 
 WIDTH, HEIGHT, FOCAL, BASELINE = 360, 240, 270.0, 0.15

@@ -27,7 +27,7 @@ def command(
 ) -> None:
     """Write a printable board of markers at exact size, and print the rig file's section for it."""
     size = page_size_mm(page)
-    layout = lay_out(dictionary, marker_ids(ids), length_mm(side), size[::-1] if landscape else size, name)
+    layout = lay_out(dictionary, marker_ids(ids), length_mm(side), (size[1], size[0]) if landscape else size, name)
     section = rig_section(layout.board)
     write_bytes(output, as_pdf(layout))
     if svg:

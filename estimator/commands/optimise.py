@@ -145,7 +145,7 @@ def _with_progress(job: Job) -> Result:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(job.log.name, total=None)
         start, length = _time_range(job.log)
         bar.update(task, total=length)
@@ -177,7 +177,8 @@ def _many(work: Sequence[Job], jobs: int, dask: str | None) -> None:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    screen = Console(stderr=True)
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         task = bar.add_task("logs", total=len(work))
         outcomes: list[Outcome[Job, str]] = []
         for outcome in choose_executor(jobs, dask).run(run_job, work):

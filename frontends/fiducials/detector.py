@@ -122,8 +122,8 @@ class MarkerFrontEnd:
         for cells in sorted({self._dictionaries[c.dictionary].cells for c in candidates}):
             group = [c for c in candidates if self._dictionaries[c.dictionary].cells == cells]
             starts = np.stack([self._ours(c, ideal) for c in group])
-            keep = np.isfinite(starts).all((1, 2))
-            group, starts = [c for c, k in zip(group, keep, strict=True) if k], starts[keep]
+            keep = np.flatnonzero(np.isfinite(starts).all((1, 2)))
+            group, starts = [group[k] for k in keep], starts[keep]
             if group:
                 patterns = [self._patterns[c.key] for c in group]
                 fit = fit_patterns(grey, starts, patterns, self._positions, self._windows(starts, cells, grey.shape))

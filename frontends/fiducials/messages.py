@@ -13,6 +13,7 @@ from .dictionaries import canonical_name
 
 Float = NDArray[np.float64]
 
+UNKNOWN_IDS = "ids that the rig does not know"
 _TO_OURS = {"opencv": [3, 2, 1, 0], "apriltag": [0, 1, 2, 3]}
 
 
@@ -66,7 +67,7 @@ def sightings_from_messages(
             sightings.append(MarkerSighting(stamp_ns, camera_name, board.id, key[1], *found))
     if unknown:
         names = ", ".join(f"{family}:{i}" for family, i in sorted(unknown))
-        reason = "ids that the rig does not know, number"
+        reason = f"{UNKNOWN_IDS}, number"
         rejections.append(
             Rejection(stamp_ns, "markers", f"{camera_name} ids {names}", reason, float(len(unknown)), 0.0)
         )

@@ -75,7 +75,12 @@ class MarkerSearch:
         self._smallest = float(min(sides))
         margin = max(20.0, 0.6 * max(sides))
         low, high = np.floor(points.min(0) - margin).astype(int), np.ceil(points.max(0) + margin).astype(int)
-        self._window = max(low[0], 0), max(low[1], 0), min(high[0], shape[1]), min(high[1], shape[0])
+        self._window = (
+            max(int(low[0]), 0),
+            max(int(low[1]), 0),
+            min(int(high[0]), shape[1]),
+            min(int(high[1]), shape[0]),
+        )
 
     def _detect(self, grey: NDArray[np.uint8], window: Window, upsample: bool) -> list[Candidate]:
         x0, y0, x1, y1 = window
@@ -89,7 +94,7 @@ class MarkerSearch:
             return []
         place = np.array([x0, y0], float)
         return [
-            Candidate(self._names[w], int(i), (np.asarray(c, float).reshape(4, 2) + 0.5) / scale - 0.5 + place)
+            Candidate(self._names[int(w)], int(i), (np.asarray(c, float).reshape(4, 2) + 0.5) / scale - 0.5 + place)
             for c, i, w in zip(corners, np.ravel(ids), np.ravel(which), strict=True)
         ]
 
