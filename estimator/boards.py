@@ -94,6 +94,18 @@ class Boards:
             return np.zeros((0, 3)), np.zeros((0, 2))
         return np.concatenate(points), np.concatenate(px)
 
+    def o_T_camera(self, seen: Sequence[MarkerSighting]) -> list[gtsam.Pose3]:
+        """Both poses of a camera from what it sees of one known board (the first sighting's)."""
+        sheet = self._sheets[seen[0].board]
+        mine = [s for s in seen if s.board == seen[0].board]
+        K = self._state.intrinsics(keys.intrinsics(seen[0].camera)).K()
+        side = float(self._state.vector(keys.page(sheet.index))[0])
+        o_T_f = self._state.pose(sheet.key)
+        return [
+            o_T_f.compose(pose3(p.camera_T_plane).inverse())
+            for p in self._candidates(sheet.board, mine, K, (side, None))
+        ]
+
     def _predicted(self, sheet: _Sheet, marker: int) -> Float:
         """Corners of a marker in {o}, shape (4, 3), from the board's pose and page."""
         side, scale = self._state.vector(keys.page(sheet.index))
@@ -137,7 +149,7 @@ class Boards:
         by_view: dict[tuple[str, str], list[MarkerSighting]] = {}
         for s in sightings:
             by_view.setdefault((s.board, s.camera), []).append(s)
-        return any(self.margin(seen) > self._gate() for seen in by_view.values())
+        return any(self.margin(seen) > self.gate() for seen in by_view.values())
 
     def margin(self, seen: list[MarkerSighting]) -> float:
         """Chi-square by which the second pose of a board in one image is worse than the first; infinite for one."""
@@ -151,7 +163,7 @@ class Boards:
             return -1.0
         return scores[1] - scores[0] if len(scores) > 1 else float("inf")
 
-    def _gate(self) -> float:
+    def gate(self) -> float:
         """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
         return float(chi2.ppf(1 - self._rig.gates.gate_probability, 6))
 
@@ -174,7 +186,7 @@ class Boards:
             return False
         scores = [self._score_of_held(sheet, pose, side) for pose in poses]
         order = np.argsort(scores)
-        if len(poses) > 1 and scores[order[1]] - scores[order[0]] < self._gate():
+        if len(poses) > 1 and scores[order[1]] - scores[order[0]] < self.gate():
             if len(sheet.held) < VIEWS_TO_DECIDE and not force:
                 return False
             text = f"board {sheet.board.id} starts from a view that allows two poses; took the better one"

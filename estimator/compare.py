@@ -84,7 +84,7 @@ class _Collector(Pipeline):
     """The estimator's own reading of a log, with the chain's single measurements in the place of the graph."""
 
     def __init__(self, rig: Rig, board: Board) -> None:
-        super().__init__(rig, lambda landmarks, sigma, cloud: ([], []))
+        super().__init__(rig, lambda landmarks_m, sigma_m, cloud: ([], []))
         self.view: BoardView | None = None
         self.frames: list[StereoFrame] = []
         self.clicks: list[ClickedPoint] = []

@@ -1,6 +1,7 @@
 """The linearised problem as one sparse system: covariances of anything, and what each factor contributes."""
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -50,13 +51,14 @@ class LinearSystem:
         self.A = csr_matrix((entries[2][keep], (i[keep], j[keep])), shape=shape)
         self.b = np.zeros(shape[0])
         self.b[i[~keep]] = entries[2][~keep]
+        self._columns = column
         self.inflation = np.ones(shape[0])
         """Variance of each row's error over what its whitening says, for errors that are correlated among rows."""
         self._normal = NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
 
     @property
     def parameters(self) -> int:
-        return self.A.shape[1]
+        return self._columns
 
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
@@ -70,7 +72,7 @@ class LinearSystem:
         return full
 
     def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
-        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: the squares of its rows are the contributions.
+        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: its rows' squares are the contributions.
 
         With C = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the larger errors
         (the sandwich form, Huber 1967).
@@ -101,11 +103,11 @@ class LinearSystem:
                 continue
             right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
             at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
-            for column, start, stop in zip(columns, at[:-1], at[1:], strict=True):
+            for column, (start, stop) in zip(columns, pairwise(at), strict=True):
                 right[column, start:stop] = np.eye(stop - start)
             inverse = self.solve(right)
             outer = middle @ inverse
-            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in zip(at[:-1], at[1:], strict=True)]
+            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in pairwise(at)]
         return found
 
     def hats(self, positions: Sequence[int]) -> list[Float]:
@@ -116,7 +118,7 @@ class LinearSystem:
             A = vstack([self.A[r] for r in rows]).tocsr()
             hat = A @ self.solve(A.T.toarray())
             at = np.concatenate([[0], np.cumsum([r.stop - r.start for r in rows])])
-            found += [hat[a:b, a:b].copy() for a, b in zip(at[:-1], at[1:], strict=True)]
+            found += [hat[a:b, a:b].copy() for a, b in pairwise(at)]
         return found
 
     def standardised(self, positions: Sequence[int]) -> list[tuple[float, int]]:
@@ -141,11 +143,11 @@ class LinearSystem:
 
         Hutchinson's estimator with fixed random signs, one solution for all groups; reproducible.
         """
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(self.A.shape[0], probes))
+        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(self.b.size, probes))
         hat = (signs * (self.A @ self.solve(self.A.T @ signs))).mean(axis=1)
         shares = np.bincount(np.repeat(group, self.rows), weights=hat, minlength=groups)
-        rows = np.bincount(np.repeat(group, self.rows), minlength=groups)
-        return np.clip(shares, 0.0, rows)
+        rows = np.bincount(np.repeat(group, self.rows), minlength=groups).astype(float)
+        return np.asarray(np.clip(shares, 0.0, rows), np.float64)
 
 
 def _chunks(widths: Sequence[int]) -> Iterator[list[int]]:

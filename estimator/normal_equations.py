@@ -34,7 +34,7 @@ class NormalEquations:
     """
 
     def __init__(self, H: csr_matrix, columns: Mapping[int, slice]) -> None:
-        self._size = H.shape[0]
+        self._size = int(H.indptr.size - 1)
         owners = np.array(sorted(columns, key=lambda k: columns[k].start), dtype=np.uint64)
         widths = np.array([columns[int(k)].stop - columns[int(k)].start for k in owners])
         self._owner = np.repeat(owners, widths)
@@ -102,11 +102,12 @@ class NormalEquations:
 
     def _factor_rest(self, H: csr_matrix) -> None:
         C, W = self._coupling, self._gain
-        if C.nnz > DENSE_COUPLING * max(C.shape[0] * C.shape[1], 1):
+        eliminated, rest = C.indptr.size - 1, H.indptr.size - 1
+        if C.nnz > DENSE_COUPLING * max(eliminated * rest, 1):
             S = H.toarray() - C.toarray().T @ W.toarray()
         else:
             S = H - C.T @ W
-            S = S.toarray() if H.shape[0] <= DENSE else csc_matrix(S)
+            S = S.toarray() if rest <= DENSE else csc_matrix(S)
         if isinstance(S, np.ndarray):
             try:
                 factor = cho_factor(S, lower=True, overwrite_a=True, check_finite=False)

@@ -17,7 +17,8 @@ from ..frontends.pipe.predict import predict_outline
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
-from .engine import Bundle, Engine
+from .bundle import Bundle
+from .engine import Engine
 from .pipes import AXIS_ROLES
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides

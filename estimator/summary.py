@@ -11,12 +11,15 @@ from ..factors.board import mean_point
 from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
+from ..factors.measurements import Event
 from ..factors.rig import dump_rig
+from . import dark_uncertainty
 from .advice import advise
 from .batch import BatchSolution
+from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .correlation import track_inflation
-from .engine import Engine
+from .engine import Engine, distance_name
 from .graph import Record
 from .linear import LinearSystem
 from .marker_points import parse_point
@@ -64,6 +67,8 @@ class Summary:
         engine = self._engine
         consistency = self._consistency()
         points = self._points()
+        distances = self._distances(between)
+        self._tell_corner_rms()
         pipes = self._pipes(points)
         around = surroundings(engine, self._values, self._system)
         points = tuple(self._with_surface(p, pipes, around) for p in points)
@@ -73,7 +78,7 @@ class Summary:
             trajectory=self._trajectory(),
             pipes=pipes,
             calibration=self._calibration(),
-            distances=self._distances(between),
+            distances=distances,
             consistency=consistency,
             rejected=(*engine.everything_rejected(), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
@@ -88,6 +93,14 @@ class Summary:
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _tell_corner_rms(self) -> None:
+        """Distance of the accepted corners from where the solution puts them."""
+        corners = [f for _, f, r in self._active if r.family == CORNERS and isinstance(f, gtsam.NoiseModelFactor)]
+        if corners:
+            rms = float(np.sqrt(np.mean([np.sum(f.unwhitenedError(self._values) ** 2) for f in corners])))
+            text = f"{len(corners)} marker corners lie {rms:.2f} px (rms) from where the solution puts them"
+            self._engine.events.append(Event(self._engine.end_ns, "corner_rms", text, "info", {"rms_px": rms}))
 
     # Points ---------------------------------------------------------------------------------------------------
 
@@ -282,6 +295,7 @@ class Summary:
     def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
         rig = self._engine.rig
         found = []
+        dark = self._dark_variance()
         asked = [(d.point_a, d.point_b, d.distance_m, d.sigma_m) for d in rig.distances]
         for a, b, given, given_sigma in [*asked, *((a, b, None, None) for a, b in between)]:
             estimate = self._distance(a, b)
@@ -289,8 +303,18 @@ class Summary:
                 if given is None:
                     raise ObservabilityError(f"distance {a} to {b}: one of the two markers was never placed by the log")
                 continue
-            found.append(DistanceEstimate(f"{a} to {b}", *estimate, given, given_sigma))
+            length, sigma = estimate
+            found.append(DistanceEstimate(f"{a} to {b}", length, float(np.hypot(sigma, dark**0.5)), given, given_sigma))
         return tuple(found)
+
+    def _dark_variance(self) -> float:
+        """Variance that the given distances show beyond the model; tells the user."""
+        sigmas = {distance_name(d): d.sigma_m for d in self._engine.rig.distances}
+        rows = [(i, sigmas[r.what]) for i, (_, _, r) in enumerate(self._active) if r.what in sigmas]
+        variance = dark_uncertainty.of_distances(self._system, [i for i, _ in rows], np.array([s for _, s in rows]))
+        if variance > 0.0:
+            self._engine.events.append(dark_uncertainty.event(variance, len(rows), self._engine.end_ns))
+        return variance
 
     def _distance(self, a: str, b: str) -> tuple[float, float] | None:
         points = [self._engine.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -44,6 +44,8 @@ class Job:
     json: Path | None
     tum: Path | None
     between: tuple[tuple[str, str], ...]
+    frame: Literal["o", "world"]
+    """Of the trajectory in TUM format."""
     command: str = ""
     """As the user typed it."""
 
@@ -57,7 +59,10 @@ def command(
     json: Annotated[
         Path | None, typer.Option("--json", help="Machine-readable result; a folder for several logs.")
     ] = None,
-    tum: Annotated[Path | None, typer.Option("--tum", help="Trajectory of {m} in {o}, TUM format.")] = None,
+    tum: Annotated[Path | None, typer.Option("--tum", help="Trajectory of {m}, TUM format.")] = None,
+    frame: Annotated[
+        Literal["o", "world"], typer.Option("--frame", help="Frame of --tum; `world` is that of the rig's world_board.")
+    ] = "o",
     between: Annotated[
         list[str] | None,
         typer.Option("--between", help="Distance between two marker points, such as '29/0 60/0' or '3 7'."),
@@ -71,7 +76,7 @@ def command(
     several = len(logs) > 1
     if several and tum is not None and not tum.is_dir():
         raise typer.BadParameter("--tum must be an existing folder for several logs")
-    work = [_job(log, output, rig, json, tum, pairs, several) for log in logs]
+    work = [_job(log, output, rig, json, tum, pairs, frame, several) for log in logs]
     for job in work:
         if job.output is not None and job.output.resolve() == job.log.resolve():
             raise SurecutError(f"{job.log}: would be overwritten by its own result; give another -o")
@@ -94,7 +99,7 @@ def _pair(text: str) -> tuple[str, str]:
 
 def _job(
     log: Path, output: Path | None, rig: Path | None, json: Path | None, tum: Path | None,
-    between: tuple[tuple[str, str], ...], several: bool,
+    between: tuple[tuple[str, str], ...], frame: Literal["o", "world"], several: bool,
 ) -> Job:  # fmt: skip
     def place(target: Path | None, suffix: str) -> Path | None:
         if target is None:
@@ -102,7 +107,8 @@ def _job(
         return target / f"{log.stem}{suffix}" if several or target.is_dir() else target
 
     typed = shlex.join(["surecut", *sys.argv[1:]])
-    return Job(log, place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"), between, typed)
+    places = (place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"))
+    return Job(log, *places, between, frame, typed)
 
 
 def _done(job: Job) -> bool:
@@ -137,7 +143,7 @@ def _write(job: Job, result: Result) -> None:
     if job.json is not None:
         write_text(job.json, to_json(result))
     if job.tum is not None:
-        write_text(job.tum, tum_text(result))
+        write_text(job.tum, tum_text(result, job.frame))
 
 
 def _with_progress(job: Job) -> Result:
