@@ -29,7 +29,9 @@ Float = NDArray[np.float64]
 
 KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
-OUTLINE_SPACING_M = 0.12
+OUTLINE_VIEWS = 16
+"""Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
+OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
 OUTLINE_PRIOR = (0.006, 0.02, 0.008)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
@@ -254,7 +256,7 @@ class Pipeline:
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
         axis = self.engine.pipes.axis(pipe)
         where = self.engine.seen_from(camera, pair.stamp_ns)
-        if axis is None or where is None:
+        if axis is None or where is None or len(looked) >= OUTLINE_VIEWS:
             return
         place = where.o_T_c.translation()
         if any(np.linalg.norm(place - other) < OUTLINE_SPACING_M for other in looked.values()):
