@@ -181,8 +181,13 @@ class Engine:
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
-        if mobile:
-            self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced))
+        if not mobile:
+            return
+        tracked = bundle.frame is not None
+        if tracked and self.boards.displaced(self._camera_poses(key), mobile):
+            self.flush()
+        joint = self.solver.joint_covariance if tracked else None
+        self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced, joint))
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
         o_T_m = self.state.pose(key)
@@ -254,7 +259,7 @@ class Engine:
 
     def _start_from_best(self) -> None:
         """No frame is free of doubt: the one with the least begins."""
-        best = max(self._waiting, key=lambda b: max((self.boards.margin([s]) for s in b.sightings), default=-1.0))
+        best = max(self._waiting, key=lambda b: self.boards.margin(b.sightings))
         self._waiting.remove(best)
         self._forced = True
         self._insert_keyframe(best)
@@ -369,7 +374,9 @@ class Engine:
             for b in self._waiting
         ]
         waiting += [
-            Rejection(p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0)
+            Rejection(
+                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0
+            )
             for p in self.lost_picks()
         ]
         return [

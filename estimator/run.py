@@ -7,6 +7,7 @@ from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, Rejection
 from ..factors.rig import Rig
 from .batch import solve
+from .board_faults import settle_boards
 from .engine import Engine, bundles
 from .result import Result
 from .summary import Summary
@@ -37,6 +38,7 @@ def finish(
         )
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    solution = settle_boards(engine, solution)
     engine.rejected += rejected
     engine.events += events
     return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))

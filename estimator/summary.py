@@ -12,10 +12,8 @@ from ..factors.geometry import ros_covariance
 from ..factors.rig import dump_rig
 from .batch import BatchSolution
 from .consistency import family_tests, judge, prior_tests
-from .correlation import track_inflation
+from .correlation import Active, inflated_system
 from .engine import Engine
-from .graph import Record
-from .linear import LinearSystem
 from .marker_points import parse_point
 from .observability import determined
 from .odometry import FAMILY as ODOMETRY
@@ -33,7 +31,6 @@ from .result import (
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
 """Names of the intrinsics' components; the skew is not reported."""
-Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 
 
 class Summary:
@@ -49,11 +46,7 @@ class Summary:
         for _, factor, _ in self._active:
             graph.add(factor)
         self._graph = graph
-        self._system = LinearSystem(graph, solution.values)
-        records = [record for _, _, record in self._active]
-        self._inflation = track_inflation(records, self._system, ODOMETRY)
-        of_tracks = np.array([r.family == ODOMETRY for r in records])
-        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = self._inflation
+        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
