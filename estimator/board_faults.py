@@ -30,6 +30,10 @@ FREE_SCALE = 0.3
 """Sigma of the print scale of a page whose given size the log contradicts."""
 MARKER_FALSE_ALARM = 1e-6
 """Probability that a marker in its place is called loose."""
+KNOCK_FALSE_ALARM = 1e-6
+"""Probability that a board that stands still is called knocked."""
+SAME_PLACE = 1e-5
+"""rad and m: nothing, against what any log shows."""
 ROUNDS = 6
 SETTLE_ROUNDS = 10
 
@@ -38,7 +42,7 @@ SETTLE_ROUNDS = 10
 class Fault:
     """A statement about a board that the log contradicts."""
 
-    kind: Literal["side", "side_restored", "scale", "marker"]
+    kind: Literal["side", "side_restored", "scale", "marker", "rejoined"]
     excess: float
     """Deviation over what is tolerated, both in sigmas of one normal variable."""
     sheet: Sheet
@@ -143,6 +147,7 @@ def _faults(look: _Look) -> list[Fault]:
             continue
         found += [_side_fault(look, sheet), _scale_fault(look, sheet)]
         found += [_marker_fault(look, sheet, what) for what in sheet.pages]
+        found += [_no_knock(look, sheet, knock) for knock in sheet.knocks]
     return [f for f in found if f is not None and f.excess > 1.0]
 
 
@@ -210,6 +215,28 @@ def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
     return Fault("marker", deviate / limit, sheet, index, record, page.marker, length, sigma)
 
 
+def _no_knock(look: _Look, sheet: Sheet, knock: Knock) -> Fault | None:
+    """A new place that the whole run does not tell from the old one."""
+    moved = _moved(look, sheet, knock)
+    place = look.find(side_words(sheet.board.id))
+    if moved is None or place is None:
+        return None
+    delta, covariance = moved
+    if delta @ np.linalg.solve(covariance, delta) > chi2.isf(KNOCK_FALSE_ALARM, 6):
+        return None
+    return Fault("rejoined", 2e9, sheet, -1, place[2], knock.epoch)
+
+
+def _moved(look: _Look, sheet: Sheet, knock: Knock) -> tuple[Float, Float] | None:
+    """Tangent of old_T_new (6,), rotation first, and its covariance."""
+    old, new = (keys.board(sheet.index, e) for e in (knock.epoch - 1, knock.epoch))
+    if not (old in look.system.columns and new in look.system.columns):
+        return None
+    between = look.values.atPose3(old).between(look.values.atPose3(new))
+    J = np.hstack([-between.inverse().AdjointMap(), np.eye(6)])
+    return gtsam.Pose3.Logmap(between), J @ look.system.joint([old, new]) @ J.T
+
+
 # Release ------------------------------------------------------------------------------------------------------
 
 
@@ -232,6 +259,9 @@ def _released(engine: Engine, fault: Fault, solution: BatchSolution) -> tuple[Up
         )
         engine.rejected.append(rejection)
         update.add(print_scale_prior(sheet.page, FREE_SCALE), fault.record)
+    elif fault.kind == "rejoined":
+        _rejoin(engine, sheet, fault, update)
+        return update, []
     else:
         page = sheet.pages[fault.record.what]
         marker = sheet.marker(page.marker)
@@ -242,6 +272,18 @@ def _released(engine: Engine, fault: Fault, solution: BatchSolution) -> tuple[Up
         sheet.loose.add(page.marker)
         _tell_loose(engine, fault)
     return update, [fault.factor]
+
+
+def _rejoin(engine: Engine, sheet: Sheet, fault: Fault, update: Update) -> None:
+    """The board's two poses are one."""
+    epoch = fault.marker
+    old, new = (keys.board(sheet.index, e) for e in (epoch - 1, epoch))
+    model = gtsam.noiseModel.Isotropic.Sigma(6, SAME_PLACE)
+    what = f"board {sheet.board.id} stands where it stood"
+    record = Record(GEOMETRY, what, fault.record.stamp_ns, what, rejectable=False)
+    update.add(gtsam.BetweenFactorPose3(old, new, gtsam.Pose3(), model), record)
+    sheet.knocks = [k for k in sheet.knocks if k.epoch != epoch]
+    engine.boards.unsay("board_knocked", f"{sheet.board.id} {epoch}")
 
 
 def _tell_loose(engine: Engine, fault: Fault) -> None:
@@ -296,10 +338,6 @@ def _tell_scale(look: _Look, sheet: Sheet, event: Event) -> None:
 
 
 def _tell_knock(look: _Look, sheet: Sheet, knock: Knock) -> None:
-    old, new = (keys.board(sheet.index, e) for e in (knock.epoch - 1, knock.epoch))
-    if not (old in look.system.columns and new in look.system.columns):
-        return
-    between = look.values.atPose3(old).between(look.values.atPose3(new))
-    J = np.hstack([-between.inverse().AdjointMap(), np.eye(6)])
-    covariance = J @ look.system.joint([old, new]) @ J.T
-    look.engine.boards.say_knock(sheet, knock, gtsam.Pose3.Logmap(between), covariance)
+    moved = _moved(look, sheet, knock)
+    if moved is not None:
+        look.engine.boards.say_knock(sheet, knock, *moved)

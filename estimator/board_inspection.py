@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from ..factors.board import page_corners
 from ..factors.camera import CameraModel
+from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.rig import Rig
 from ..frontends.board_check import Suspicion, suspicious_markers
@@ -75,6 +76,12 @@ class Inspection:
             mine = self._once_each(sheet, mine)
             good += self._consistent(sheet, mine)
         return good
+
+    @staticmethod
+    def in_place(sheet: Sheet, seen: Sequence[MarkerSighting]) -> list[MarkerSighting]:
+        """Sightings under the ids whose places they have, without markers that are known to be loose."""
+        placed = [relabelled(s, sheet.place(s.marker)) for s in seen]
+        return [s for s in placed if s.marker not in sheet.loose]
 
     # Twice in one image ---------------------------------------------------------------------------------------
 
@@ -143,7 +150,10 @@ class Inspection:
     def _fit(self, sheet: Sheet, seen: list[MarkerSighting]) -> tuple[float, int] | None:
         """Chi-square and degrees of freedom of one image, its side length free."""
         board, common, camera = sheet.board, self._rig.noise.marker_common_px, self._pinhole(seen[0].camera)
-        side = self._side(sheet) if sheet.page_known else apparent_side(seen, board, camera, common)[0]
+        try:
+            side = self._side(sheet) if sheet.page_known else apparent_side(seen, board, camera, common)[0]
+        except ObservabilityError:
+            return None
         starts = board_pose_candidates(seen, board, camera, side, common)
         if not starts:
             return None

@@ -13,7 +13,6 @@ from ..factors.geometry import pose3
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Rig
 from ..frontends.board_pose import board_pose_candidates
-from .correlation import LARGEST
 from .graph import State
 from .sheet import Displaced, Sheet
 
@@ -21,8 +20,8 @@ Float = NDArray[np.float64]
 Joint = Callable[[Sequence[int]], Float]
 """Joint covariance of variables, in the order of their keys."""
 
-FALSE_ALARM = 1e-6
-"""Probability of calling a view displaced that is not."""
+DISAGREE = 1e-6
+"""Probability that two views of one place are taken for views of two."""
 VIEWS_TO_BELIEVE = 3
 """Keyframes in a row that have to agree on a new place."""
 
@@ -39,8 +38,8 @@ def displacement(
 ) -> Displaced | None:
     """A view that contradicts the board's place, by more than fit, camera and place are uncertain; else None.
 
-    The covariances of camera and place are taken with the largest factor by which successive errors of tracks can be
-    alike (see `correlation`): they come from the running solver, which does not know it.
+    The running solver takes errors of tracks for independent, and is too sure of the camera where they are not: a new
+    place is on trial until the end of the run.
     """
     stamp_ns = seen[0].stamp_ns
     camera = max(sorted(camera_poses), key=lambda c: len({s.marker for s in seen if s.camera == c}))
@@ -52,7 +51,7 @@ def displacement(
     if not found:
         return Displaced(keyframe, stamp_ns, seen, None, None)
     expected = state.pose(sheet.key)
-    spread = LARGEST * joint([keyframe, sheet.key])
+    spread = joint([keyframe, sheet.key])
     best: tuple[float, gtsam.Pose3, Float] | None = None
     for candidate in found:
         camera_T_f = np.array(candidate.camera_T_f)
@@ -68,7 +67,7 @@ def displacement(
         if best is None or distance < best[0]:
             best = distance, o_T_f, own + J[:, :6] @ spread[:6, :6] @ J[:, :6].T
     assert best is not None
-    if best[0] < chi2.isf(FALSE_ALARM, 6):
+    if best[0] < chi2.isf(rig.gates.gate_probability, 6):
         return None
     return Displaced(keyframe, stamp_ns, seen, best[1], best[2])
 
@@ -81,7 +80,7 @@ def new_place(displaced: list[Displaced]) -> gtsam.Pose3 | None:
     last, own = told[-1]
     for other, covariance in told[-VIEWS_TO_BELIEVE:-1]:
         delta = gtsam.Pose3.Logmap(last.between(other))
-        if delta @ np.linalg.solve(own + covariance, delta) > chi2.isf(FALSE_ALARM, 6):
+        if delta @ np.linalg.solve(own + covariance, delta) > chi2.isf(DISAGREE, 6):
             return None
     return last
 
@@ -96,7 +95,7 @@ def still_moving(displaced: list[Displaced]) -> list[Displaced]:
         if view.o_T_f is None or view.covariance is None:
             continue
         delta = gtsam.Pose3.Logmap(last.o_T_f.between(view.o_T_f))
-        if delta @ np.linalg.solve(last.covariance + view.covariance, delta) > chi2.isf(FALSE_ALARM, 6):
+        if delta @ np.linalg.solve(last.covariance + view.covariance, delta) > chi2.isf(DISAGREE, 6):
             gone.append(view)
     return gone
 

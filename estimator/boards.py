@@ -126,14 +126,18 @@ class Boards:
     # A keyframe -----------------------------------------------------------------------------------------------
 
     def displaced(self, camera_poses: Mapping[str, gtsam.Pose3], sightings: Sequence[MarkerSighting]) -> bool:
-        """Is a known board off its predicted place? The cameras should then be placed as well as can be, before `add`."""
-        return any(self._off(sheet, camera_poses, seen) for sheet, seen in self._by_sheet(sightings) if sheet.known)
+        """Is a known board off its predicted place? The cameras should then be placed as well as can be."""
+        return any(
+            self._off(sheet, camera_poses, self.inspection.in_place(sheet, seen))
+            for sheet, seen in self._by_sheet(sightings)
+            if sheet.known
+        )
 
     def _off(self, sheet: Sheet, camera_poses: Mapping[str, gtsam.Pose3], seen: list[MarkerSighting]) -> bool:
         if sheet.displaced:
             return True
         shifts = [np.linalg.norm(np.median(shift, axis=0)) for _, shift in self._shifts(sheet, camera_poses, seen)]
-        return bool(max(shifts) > LOOK_AGAIN_PX)
+        return bool(max(shifts, default=0.0) > LOOK_AGAIN_PX)
 
     def add(
         self,

@@ -183,10 +183,10 @@ class Engine:
         mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
         if not mobile:
             return
-        tracked = bundle.frame is not None
-        if tracked and self.boards.displaced(self._camera_poses(key), mobile):
+        joint = None
+        if bundle.frame is not None and self.boards.displaced(self._camera_poses(key), mobile):
             self.flush()
-        joint = self.solver.joint_covariance if tracked else None
+            joint = self.solver.joint_covariance
         self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced, joint))
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
