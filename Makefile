@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check format clean
+.PHONY: demo test check format clean bench campaign
 
 demo: $(READY)
 	$(BIN)/surecut demo
@@ -26,6 +26,12 @@ $(READY): pyproject.toml
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --editable . --group dev
 	touch $@
+
+bench: $(READY)
+	OMP_NUM_THREADS=2 $(BIN)/python benchmarks/run.py --gate 2.0
+
+campaign: $(READY)
+	$(BIN)/surecut campaign -o logs/campaign --runs 1000 --jobs 2 --validation docs/validation.md
 
 clean:
 	rm -rf $(VENV) build *.egg-info

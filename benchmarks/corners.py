@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import cv2
+import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -179,10 +181,44 @@ def conditions() -> list[Condition]:
     return result
 
 
+def figure(rows: list[Row], path: Path) -> None:
+    """Bias and scatter against size, tilt and blur, ours and OpenCV's, and the honesty of our covariance."""
+    matplotlib.use("svg")
+    _, (biases, scatters, honesty) = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+    plain = [r for r in rows if r.condition.motion_px == 0 and r.condition.dictionary == "DICT_4X4_50"]
+    plain = [r for r in plain if r.condition.white > 100 and r.found]
+    jitter = {0: 0.97, 25: 1.0, 50: 1.03}
+    for name, colour in (("NONE", "#b0b0b0"), ("SUBPIX", "#d08040"), ("APRILTAG", "#4080c0")):
+        some = [r for r in plain if r.opencv[name][2]]
+        x = [r.condition.side_px * jitter[int(r.condition.tilt_deg)] for r in some]
+        biases.plot(x, [r.opencv[name][0] for r in some], "o", ms=3, color=colour, label=f"OpenCV {name}")
+        scatters.plot(x, [r.opencv[name][1] for r in some], "o", ms=3, color=colour, label=f"OpenCV {name}")
+    marks = {0.5: "o", 0.8: "s", 1.3: "^", 2.0: "v"}
+    for blur, mark in marks.items():
+        some = [r for r in plain if r.condition.blur_px == blur]
+        x = [r.condition.side_px * jitter[int(r.condition.tilt_deg)] for r in some]
+        label = f"pattern fit, blur {blur:g} px"
+        biases.plot(x, [r.outward for r in some], mark, ms=4, color="#108040", mfc="none", label=label)
+        scatters.plot(x, [r.rms for r in some], mark, ms=4, color="#108040", mfc="none", label=label)
+        honesty.plot(x, [r.nees_per_dof for r in some], mark, ms=4, color="#108040", mfc="none", label=label)
+    honesty.axhspan(0.8, 1.25, color="#108040", alpha=0.12)
+    titles = ("outward bias, px", "rms error per coordinate, px", "squared error / covariance, per coordinate")
+    for axes, title in zip((biases, scatters, honesty), titles, strict=True):
+        axes.set(title=title, xlabel="side of the marker, px", xscale="log")
+        axes.set_xticks([18, 25, 40, 80, 150], ["18", "25", "40", "80", "150"])
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    scatters.set_yscale("log")
+    honesty.set_ylim(0, 2)
+    biases.legend(fontsize=7)
+    plt.savefig(path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--figure", type=Path)
     arguments = parser.parse_args()
     print("side tilt blur noise motion white dictionary    found  outward      rms    sigma  NEES/dof largest")
     rows = []
@@ -197,6 +233,8 @@ def main() -> None:
             + "  ".join(f"{name} {o[0]:+.3f} {o[1]:.3f} {o[2]}" for name, o in row.opencv.items()),
             flush=True,
         )
+    if arguments.figure:
+        figure(rows, arguments.figure)
     if arguments.json:
         arguments.json.write_text(json.dumps([asdict(row) for row in rows], indent=1))
 

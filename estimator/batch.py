@@ -6,10 +6,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors import keys
 from ..factors.measurements import Rejection
 from ..factors.noise import huber_norm, robust_scale
-from .graph import FactorLog
-from .linear import LinearSystem
+from .graph import FactorLog, Record
+from .linear import LinearSystem, deviate
 from .observability import determined
 
 Float = NDArray[np.float64]
@@ -21,6 +22,8 @@ SNOOPED = ("depth cloud", "pipe outline", "picks")
 """Families of few measurements, each of which may hold a degree of freedom almost alone."""
 SNOOPING_SIGMA = 3.7
 SNOOPING_ROUNDS = 8
+MINIMUM_VIEWS = 2
+"""Pixels that a landmark needs to be a point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +50,9 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
                 break
             rejected += [r for _, r in found]
             off |= {i for i, _ in found}
+            alone = orphans(log, off)
+            rejected += [r for _, r in alone]
+            off |= {i for i, _ in alone}
             values, more = _optimise(_without(log, off), values)
             iterations += more
     return BatchSolution(values, first, tuple(sorted(off)), tuple(rejected), iterations)
@@ -86,11 +92,50 @@ def outliers(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set
     for index, factor, record in log.active():
         if index in off or not record.rejectable:
             continue
+        depth_m = landmark_depth(factor, record, values)
+        if depth_m is not None and depth_m <= 0:
+            reason = "landmark behind the camera by m"
+            found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, -depth_m, 0.0)))
+            continue
         norm = residual_norm(factor, values, robust_sigma, True)
         limit = robust_scale(OUTLIER_SIGMA, factor.dim())
         if norm > limit:
             reason = "whitened residual"
             found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, norm, limit)))
+    return found
+
+
+def landmark_depth(factor: gtsam.NonlinearFactor, record: Record, values: gtsam.Values) -> float | None:
+    """How far before the mobile camera a factor's landmark is; None for factors of anything else.
+
+    GTSAM's projection factors give the residual zero for a point behind the camera, so the residual cannot tell.
+    """
+    if record.camera not in ("m_left", "m_right"):
+        return None
+    involved = factor.keys()
+    landmark = next((key for key in involved if keys.kind(key) == "l"), None)
+    pose = next((key for key in involved if keys.kind(key) == "x"), None)
+    if landmark is None or pose is None:
+        return None
+    return float(values.atPose3(pose).transformTo(values.atPoint3(landmark))[2])
+
+
+def orphans(log: FactorLog, off: set[int]) -> list[tuple[int, Rejection]]:
+    """What is left of landmarks that the removal of outliers left with one view: it determines no point."""
+    views: dict[int, list[int]] = {}
+    for index, factor, record in log.active():
+        if index in off or record.camera is None:
+            continue
+        for key in factor.keys():
+            if keys.kind(key) == "l":
+                views.setdefault(key, []).append(index)
+    lonely = {key for key, indices in views.items() if len(indices) < MINIMUM_VIEWS}
+    found = []
+    for index, factor, record in log.active():
+        if index not in off and lonely.intersection(factor.keys()):
+            left = float(max(len(views[key]) for key in factor.keys() if key in lonely))
+            reason = "too few good views of the landmark; views"
+            found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, left, MINIMUM_VIEWS)))
     return found
 
 
@@ -102,15 +147,17 @@ def snooped(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[
     family and round, because one wrong measurement makes its neighbours look wrong.
     """
     active = [(i, f, r) for i, f, r in log.active() if i not in off]
+    positions = [i for i, (_, _, r) in enumerate(active) if r.rejectable and r.family in SNOOPED]
+    if not positions:
+        return []
     graph = gtsam.NonlinearFactorGraph()
     for _, factor, _ in active:
         graph.add(factor)
     system = LinearSystem(graph, values)
     worst: dict[str, tuple[float, int, Rejection]] = {}
-    for position, (index, _, record) in enumerate(active):
-        if not record.rejectable or record.family not in SNOOPED:
-            continue
-        sigma = system.standardised(position)
+    for position, (total, dof) in zip(positions, system.standardised(positions), strict=True):
+        index, _, record = active[position]
+        sigma = deviate(total, dof) if dof else 0.0
         if sigma > SNOOPING_SIGMA and sigma > worst.get(record.family, (0.0,))[0]:
             told = Rejection(
                 record.stamp_ns, record.family, record.what, "off the rest by sigmas", sigma, SNOOPING_SIGMA

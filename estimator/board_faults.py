@@ -18,7 +18,7 @@ from .corner_inset import Insets, corrected_corners, inset_directions
 from .correlation import Active, inflated_system
 from .engine import Engine
 from .graph import Record, Update
-from .linear import LinearSystem
+from .linear import LinearSystem, deviate
 from .odometry import FAMILY as ODOMETRY
 from .sheet import Knock, Sheet
 
@@ -99,7 +99,7 @@ def settle_boards(engine: Engine, solution: BatchSolution) -> BatchSolution:
 def _look(engine: Engine, solution: BatchSolution) -> _Look:
     off = set(solution.outliers)
     active = [row for row in engine.solver.log.active() if row[0] not in off]
-    system, _ = inflated_system(active, solution.values, ODOMETRY)
+    system = inflated_system(active, solution.values, ODOMETRY)
     names, sigmas, C = inset_directions(engine.solver.log, active, system, solution.values, engine.boards)
     return _Look(engine, solution.values, active, system, Insets(names, sigmas, system.shift(C)), C)
 
@@ -169,8 +169,8 @@ def _side_fault(look: _Look, sheet: Sheet) -> Fault | None:
     if information[0, 0] < 1e-6 * shift.alone[0]:
         return None
     covariance = np.linalg.inv(information)
-    deviate = abs(float((covariance @ shift.right)[0])) / float(np.sqrt(covariance[0, 0]))
-    return Fault("side", deviate / GATE_SIGMA, sheet, index, record)
+    off = abs(float((covariance @ shift.right)[0])) / float(np.sqrt(covariance[0, 0]))
+    return Fault("side", off / GATE_SIGMA, sheet, index, record)
 
 
 def _side_off(look: _Look, sheet: Sheet) -> tuple[float, float]:
@@ -188,7 +188,8 @@ def _scale_fault(look: _Look, sheet: Sheet) -> Fault | None:
     place = look.find(scale_words(sheet.board.id))
     if place is None or look.engine.boards.told("print_scale_wrong", sheet.board.id):
         return None
-    return Fault("scale", look.system.standardised(place[0]) / GATE_SIGMA, sheet, place[1], place[2])
+    off = deviate(*look.system.standardised([place[0]])[0])
+    return Fault("scale", off / GATE_SIGMA, sheet, place[1], place[2])
 
 
 def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
@@ -207,12 +208,12 @@ def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
         return None
     value, covariance = shift.solution()
     total = float(value @ shift.information @ value)
-    deviate = float(norm.isf(max(float(chi2.sf(total, 3)), 1e-300) / 2))
+    off = deviate(total, 3)
     limit = float(norm.isf(MARKER_FALSE_ALARM / 2))
     length = float(np.linalg.norm(value[:2]))
     along = value[:2] / max(length, 1e-12)
     sigma = float(np.sqrt(along @ covariance[:2, :2] @ along))
-    return Fault("marker", deviate / limit, sheet, index, record, page.marker, length, sigma)
+    return Fault("marker", off / limit, sheet, index, record, page.marker, length, sigma)
 
 
 def _no_knock(look: _Look, sheet: Sheet, knock: Knock) -> Fault | None:

@@ -72,7 +72,7 @@ class Inspection:
         good: list[MarkerSighting] = []
         for camera in sorted({s.camera for s in seen}):
             mine = [relabelled(s, sheet.place(s.marker)) for s in seen if s.camera == camera]
-            mine = self._without(mine, [s.marker in sheet.loose for s in mine], sheet, "is not on its place; markers")
+            mine = self._without(mine, [s.marker in sheet.loose for s in mine], sheet, "is not on its place, markers")
             mine = self._once_each(sheet, mine)
             good += self._consistent(sheet, mine)
         return good
@@ -102,7 +102,7 @@ class Inspection:
         for marker in double:
             self.doubled(sheet.board.id, marker, seen[0].stamp_ns)
         refuse = [k not in keep for k in range(len(seen))]
-        return self._without(seen, refuse, sheet, "stands in the image more than once; places")
+        return self._without(seen, refuse, sheet, "stands in the image more than once, places")
 
     def _expected(self, sheet: Sheet, rest: list[MarkerSighting], markers: list[int]) -> dict[int, Float]:
         """Where markers ought to be in an image, by the rest of their board; nothing where that is in doubt."""
@@ -176,7 +176,7 @@ class Inspection:
             votes = self._votes.setdefault(("swapped", board, a * 10000 + b), _Votes())
             votes.add(stamp_ns, swapped[0])
             if len(votes.stamps) < VIEWS_TO_EXCHANGE:
-                return self._without(seen, [True] * len(seen), sheet, "of two exchanged ids; views so far")
+                return self._without(seen, [True] * len(seen), sheet, "of two exchanged ids, views so far")
             self._exchange(sheet, a, b, votes)
             return [relabelled(s, {a: b, b: a}.get(s.marker, s.marker)) for s in seen]
         off = {s.marker for s in found}
@@ -184,7 +184,7 @@ class Inspection:
         for suspicion in found:
             self._vote(sheet, stamp_ns, suspicion)
         refused = [s.marker in off for s in seen]
-        return self._without(seen, refused, sheet, "off its place against the rest of the image; markers")
+        return self._without(seen, refused, sheet, "off its place against the rest of the image, markers")
 
     def _exchange(self, sheet: Sheet, a: int, b: int, votes: _Votes) -> None:
         sheet.exchanged[a], sheet.exchanged[b] = sheet.place(b), sheet.place(a)

@@ -17,6 +17,7 @@ from .board_moves import Joint, displacement, may_be_the_board, new_place, still
 from .board_start import FirstPose, Side
 from .graph import Record, State, Update
 from .sheet import Displaced, Knock, PageFactor, Sheet
+from .view_cells import ViewCells
 
 Float = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ class Boards:
         self.sheets = {board.id: Sheet(i, board) for i, board in enumerate(rig.boards)}
         self._markers = {(b.id, m.id): m for b in rig.boards for m in b.markers}
         self._next_slot = 0
-        self._cells: dict[tuple[str, str], list[tuple[gtsam.Pose3, int]]] = {}
+        self._cells: dict[tuple[str, str], ViewCells] = {}
         self._first = FirstPose(rig, state)
         self.inspection = Inspection(rig, state, self._first.pinhole)
         self._told: dict[tuple[str, str], Event] = {}
@@ -176,7 +177,7 @@ class Boards:
         sheet.held.append((keyframe, seen))
         if len(sheet.held) > HELD_VIEWS:
             _, dropped = sheet.held.pop(1)
-            self._refuse(sheet, dropped, "board not placed for long; views held", len(sheet.held), HELD_VIEWS)
+            self._refuse(sheet, dropped, "board not placed for long, views held", len(sheet.held), HELD_VIEWS)
 
     def _start(
         self,
@@ -250,7 +251,7 @@ class Boards:
 
     def _forget(self, sheet: Sheet, views: Sequence[Displaced]) -> None:
         for view in views:
-            self._refuse(sheet, view.seen, "board not in its place; views that agree", 1.0, 3.0)
+            self._refuse(sheet, view.seen, "board not in its place, views that agree", 1.0, 3.0)
         sheet.displaced = [v for v in sheet.displaced if not any(v is gone for gone in views)]
 
     def _reopen(self, sheet: Sheet, place: gtsam.Pose3, update: Update) -> None:
@@ -376,19 +377,14 @@ class Boards:
         Views are counted per cell of viewing position; the n-th view of a cell gets n times the common variance, so
         that standing still gives no more than one view's worth of it.
         """
-        common = self._rig.noise.marker_common_px
-        view = self._pose_of(sheet.key, update).between(self._pose_of(keyframe, update))
-        cells = self._cells.setdefault((sheet.board.id, sighting.camera), [])
-        for i, (other, count) in enumerate(cells):
-            if _same_view(view, other):
-                views = count + (1 if sighting.marker == min(sheet.slots, default=sighting.marker) else 0)
-                cells[i] = (other, views)
-                if count > STILL_VIEWS and sighting.marker in sheet.slots:
-                    self._refuse(sheet, [sighting], "one more view from the same place; views", count, STILL_VIEWS)
-                    return None
-                return sighting.covariance_px2 + np.eye(2) * common**2 * max(count, 1)
-        cells.append((view, 1))
-        return sighting.covariance_px2 + np.eye(2) * common**2
+        cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
+        if cells.last != keyframe:
+            view = self._pose_of(sheet.key, update).between(self._pose_of(keyframe, update))
+            cells.count(keyframe, view.matrix())
+        if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
+            self._refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
+            return None
+        return sighting.covariance_px2 + np.eye(2) * self._rig.noise.marker_common_px**2 * cells.views
 
     # Book-keeping ---------------------------------------------------------------------------------------------
 
@@ -399,7 +395,7 @@ class Boards:
             for _, seen in sheet.held:
                 found += [_rejection(sheet, s, "board never placed: views", len(sheet.held), 1.0) for s in seen]
             for view in sheet.displaced:
-                reason = "board not in its place; views that agree"
+                reason = "board not in its place, views that agree"
                 found += [_rejection(sheet, s, reason, len(sheet.displaced), 3.0) for s in view.seen]
         return found
 
@@ -472,12 +468,3 @@ def scale_words(board: str) -> str:
 def _rejection(sheet: Sheet, s: MarkerSighting, reason: str, value: float, limit: float) -> Rejection:
     what = f"marker {s.marker} of board {sheet.board.id} in {s.camera}"
     return Rejection(s.stamp_ns, FAMILY, what, reason, float(value), float(limit))
-
-
-def _same_view(a: gtsam.Pose3, b: gtsam.Pose3) -> bool:
-    """Two views of a board that share their sub-pixel error: less than 2 cm and 2 degrees apart."""
-    difference = a.between(b)
-    return bool(
-        np.linalg.norm(difference.translation()) < 0.02
-        and np.linalg.norm(gtsam.Rot3.Logmap(difference.rotation())) < 0.035
-    )

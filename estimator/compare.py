@@ -10,7 +10,7 @@ from ..factors.camera import CameraModel
 from ..factors.errors import RigError
 from ..factors.measurements import MarkerSighting, Pick, StereoFrame
 from ..factors.rig import Board, Rig
-from ..frontends.paper_chain import clicked_point, marker_pose
+from ..frontends.paper_chain import clicked_point, marker_pose, plain_sightings
 from ..io.messages import CameraInfoBody, DetectionsBody, Message, PickBody
 from ..io.pairing import StereoPair
 from .baseline import BoardChoice, BoardView, ChainPoint, ClickedPoint, behind_surface, paper_chain
@@ -84,7 +84,7 @@ class _Collector(Pipeline):
     """The estimator's own reading of a log, with the chain's single measurements in the place of the graph."""
 
     def __init__(self, rig: Rig, board: Board) -> None:
-        super().__init__(rig, lambda landmarks, sigma, cloud: ([], []))
+        super().__init__(rig, lambda landmarks_m, sigma_m, cloud: ([], []))
         self.view: BoardView | None = None
         self.frames: list[StereoFrame] = []
         self.clicks: list[ClickedPoint] = []
@@ -105,7 +105,10 @@ class _Collector(Pipeline):
                 self.clicks.append(self._click(self.sensors.pick(item.stamp_ns, item.body), pair))
 
     def _first_view(self, group: list[Item], pair: PairImages | None) -> BoardView | None:
-        sightings = [] if pair is None else self.sensors.markers("m_left", pair.stamp_ns, pair.left)
+        sightings = []
+        if pair is not None and "m_left" in self.sensors.cameras:
+            camera = self.sensors.cameras["m_left"]
+            sightings = plain_sightings(pair.stamp_ns, pair.left, self._board, camera)
         for item in group:
             if isinstance(item, Message) and isinstance(item.body, DetectionsBody):
                 camera = self._camera_of(item.topic)

@@ -9,7 +9,7 @@ from scipy.stats import chi2, norm
 
 from .batch import residual_norm
 from .graph import FactorLog, Record
-from .linear import DETERMINED, LinearSystem, deviate
+from .linear import LinearSystem, deviate
 from .result import Consistency, FamilyConsistency
 
 Float = NDArray[np.float64]
@@ -73,23 +73,12 @@ def prior_tests(
     active: list[tuple[int, gtsam.NonlinearFactor, Record]], system: LinearSystem, families: tuple[str, ...]
 ) -> list[PriorTest]:
     """Each prior against the rest: its residual has covariance I - H, H its block of the hat matrix."""
+    positions = [i for i, (_, _, r) in enumerate(active) if not r.rejectable and r.family in families]
     tests = []
-    for position, (_, _, record) in enumerate(active):
-        if record.rejectable or record.family not in families:
-            continue
-        rows = slice(system.starts[position], system.starts[position + 1])
-        A = system.A[rows].toarray()
-        hat = A @ system.solve(A.T)
-        spread = np.eye(A.shape[0]) - 0.5 * (hat + hat.T)
-        eigenvalues, vectors = np.linalg.eigh(spread)
-        free = eigenvalues > DETERMINED
-        if not free.any():
-            continue
-        residual = -system.b[rows]
-        along = (vectors.T @ residual)[free]
-        total = float((along**2 / eigenvalues[free]).sum())
-        dof = int(free.sum())
-        tests.append(PriorTest(record, total, dof, deviate(total, dof), residual))
+    for position, (total, dof) in zip(positions, system.standardised(positions), strict=True):
+        if dof:
+            residual = -system.b[system.starts[position] : system.starts[position + 1]]
+            tests.append(PriorTest(active[position][2], total, dof, deviate(total, dof), residual))
     return tests
 
 

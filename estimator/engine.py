@@ -40,6 +40,10 @@ from .surfaces import Associator, Surfaces, SurfaceSettings
 
 Float = NDArray[np.float64]
 
+MARKER_KEYFRAMES = 10
+"""Keyframes of markers alone that share an update: each stands on known boards already, and every update touches the
+corners of all of them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
@@ -79,6 +83,8 @@ class Engine:
         self._pending = Update()
         self.open_picks: list[tuple[Pick, tuple[float, float] | None]] = []
         """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
+        self._unsolved = 0
+        """Keyframes since the last update."""
         self.end_ns = 0
 
     # The loop -------------------------------------------------------------------------------------------------
@@ -97,12 +103,14 @@ class Engine:
             self._picks_of(bundle)
         for outline in bundle.outlines:
             self.add_outline(outline)
-        return self.flush()
+        urgent = bundle.frame is not None or bundle.picks or bundle.outlines or bundle.cloud is not None
+        return self.flush() if urgent or self._unsolved >= MARKER_KEYFRAMES else False
 
     def flush(self) -> bool:
         """One iSAM2 update with what has gathered."""
         if self._pending.empty():
             return False
+        self._unsolved = 0
         update, self._pending = self._pending, Update()
         self.state.values = self.solver.update(update)
         return True
@@ -176,8 +184,10 @@ class Engine:
         self._see_boards(keys.keyframe(index), bundle)
         self._open_base(bundle.stamp_ns)
         self._close_distances(bundle.stamp_ns)
-        self.flush()
-        self._lay_landmarks(index)
+        self._unsolved += 1
+        if bundle.frame is not None:
+            self.flush()
+            self._lay_landmarks(index)
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
@@ -251,7 +261,8 @@ class Engine:
                 self._insert_keyframe(bundle)
                 if not self._waits(bundle):
                     self._picks_of(bundle)
-                self.flush()
+                if self._unsolved >= MARKER_KEYFRAMES:
+                    self.flush()
             if len(self._waiting) == before:
                 break
         self._retry_picks()
@@ -375,7 +386,7 @@ class Engine:
         ]
         waiting += [
             Rejection(
-                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp; frames", 0.0, 1.0
+                p.stamp_ns, "picks", f"pick {p.point_id} in {p.camera}", "no frame of its stamp, frames", 0.0, 1.0
             )
             for p in self.lost_picks()
         ]

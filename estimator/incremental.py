@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors.errors import ObservabilityError
 from .graph import FactorLog, Update
 from .observability import determined
 
@@ -38,26 +39,55 @@ class Incremental:
     """iSAM2 with the bookkeeping that lets single measurements be switched off again."""
 
     def __init__(self) -> None:
-        parameters = gtsam.ISAM2Params()
-        thresholds = gtsam.ISAM2ThresholdMap()
-        for letter, values in _THRESHOLDS.items():
-            thresholds.insert((letter, np.array(values)))
-        parameters.setRelinearizeThreshold(thresholds)
-        parameters.relinearizeSkip = RELINEARIZE_EVERY
-        self._isam = gtsam.ISAM2(parameters)
+        self._isam = gtsam.ISAM2(_parameters())
+        self._slots: list[int | None] = []
+        """iSAM2's index of each factor of the log."""
+        self._values = gtsam.Values()
         self.log = FactorLog()
 
     def update(self, update: Update, remove: Iterable[int] = ()) -> gtsam.Values:
-        """Takes the new factors and guesses, switches off the factors `remove`, and returns the estimate."""
+        """Takes the new factors and guesses, switches off the factors `remove`, and returns the estimate.
+
+        Raises:
+            ObservabilityError: a variable is not determined by the factors, at any linearisation.
+        """
         graph = gtsam.NonlinearFactorGraph()
         for factor in update.factors:
             graph.add(factor)
         removed = [i for i in remove if i not in self.log.off]
-        with determined():
-            self._isam.update(graph, update.values, removed)
+        slots = [slot for i in removed if (slot := self._slots[i]) is not None]
+        first = self._isam.getFactorsUnsafe().size()
         self.log.append(update)
         self.log.off.update(removed)
-        return self._isam.calculateEstimate()
+        try:
+            with determined():
+                self._isam.update(graph, update.values, slots)
+            self._slots += range(first, first + len(update.factors))
+            self._values = self._isam.calculateEstimate()
+        except ObservabilityError:
+            self._values.insert(update.values)
+            self._rebuild()
+        return gtsam.Values(self._values)
+
+    def _rebuild(self) -> None:
+        """Starts iSAM2 anew from a damped batch optimum.
+
+        A linearisation far from the optimum can be singular although the problem is not: new landmarks and axes start
+        from rough guesses. Levenberg-Marquardt gets across; what stays singular there is not observable.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        self._slots = []
+        for index, factor in enumerate(self.log.factors):
+            off = index in self.log.off
+            self._slots.append(None if off else graph.size())
+            if not off:
+                graph.add(factor)
+        optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values, gtsam.LevenbergMarquardtParams())
+        with determined():
+            values = optimiser.optimize()
+            self._isam = gtsam.ISAM2(_parameters())
+            self._isam.update(graph, values)
+        self._values = self._isam.calculateEstimate()
 
     def settle(self, rounds: int) -> gtsam.Values:
         """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
@@ -67,9 +97,20 @@ class Incremental:
                 result = self._isam.update(empty, none, force_relinearize=True)
             if result.getVariablesRelinearized() == 0:
                 break
-        return self._isam.calculateEstimate()
+        self._values = self._isam.calculateEstimate()
+        return gtsam.Values(self._values)
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
         """Joint covariance of some variables, in the order of `keys`."""
         joint = self._isam.jointMarginalCovariance(list(keys))
         return np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+
+def _parameters() -> gtsam.ISAM2Params:
+    parameters = gtsam.ISAM2Params()
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for letter, values in _THRESHOLDS.items():
+        thresholds.insert((letter, np.array(values)))
+    parameters.setRelinearizeThreshold(thresholds)
+    parameters.relinearizeSkip = RELINEARIZE_EVERY
+    return parameters

@@ -1,19 +1,24 @@
 """The linearised problem as one sparse system: covariances of anything, and what each factor contributes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_matrix, vstack
 from scipy.stats import chi2, norm
+
+from .normal_equations import NormalEquations
 
 Float = NDArray[np.float64]
 
 DETERMINED = 1e-3
 """A residual direction with less than this share of its own variance left is determined by its own measurement."""
+
+CHUNK = 384
+"""Right-hand sides that are solved together."""
 
 
 def deviate(total: float, dof: int) -> float:
@@ -71,20 +76,18 @@ class LinearSystem:
         self.A = csr_matrix((entries[2][keep], (i[keep], j[keep])), shape=shape)
         self.b = np.zeros(shape[0])
         self.b[i[~keep]] = entries[2][~keep]
-        information = csc_matrix(self.A.T @ self.A)
+        self._columns = column
         self.inflation = np.ones(shape[0])
         """Variance of each row's error over what its whitening says, for errors that are correlated among rows."""
-        self._factor = splu(
-            information, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        self._normal = NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
 
     @property
     def parameters(self) -> int:
-        return self.A.shape[1]
+        return self._columns
 
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
-        return self._factor.solve(np.ascontiguousarray(right))
+        return self._normal.solve(right)
 
     def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""
@@ -94,7 +97,7 @@ class LinearSystem:
         return full
 
     def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
-        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: the squares of its rows are the contributions.
+        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: its rows' squares are the contributions.
 
         With C = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the larger errors
         (the sandwich form, Huber 1967).
@@ -113,17 +116,49 @@ class LinearSystem:
         blocks = [(k, np.eye(offsets[-1])[:, offsets[i] : offsets[i + 1]]) for i, k in enumerate(keys)]
         return self.covariance(blocks)
 
-    def standardised(self, position: int) -> float:
-        """Residual of one factor against what all others predict, as a deviate of one normal variable."""
-        rows = slice(self.starts[position], self.starts[position + 1])
-        A = self.A[rows].toarray()
-        hat = A @ self.solve(A.T)
-        eigenvalues, vectors = np.linalg.eigh(np.eye(A.shape[0]) - 0.5 * (hat + hat.T))
-        free = eigenvalues > DETERMINED
-        if not free.any():
-            return 0.0
-        along = (vectors.T @ self.b[rows])[free]
-        return deviate(float((along**2 / eigenvalues[free]).sum()), int(free.sum()))
+    def marginals(self, keys: Sequence[int]) -> list[Float]:
+        """Each variable's own covariance."""
+        found = []
+        inflated = np.any(self.inflation != 1.0)
+        middle = csr_matrix(self.A.T @ self.A.multiply(self.inflation[:, None])) if inflated else None
+        for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys]):
+            columns = [self.columns[keys[i]] for i in chunk]
+            if middle is None:
+                found += self._normal.inverse_blocks(columns)
+                continue
+            right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
+            at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
+            for column, start, stop in zip(columns, at[:-1], at[1:], strict=True):
+                right[column, start:stop] = np.eye(stop - start)
+            inverse = self.solve(right)
+            outer = middle @ inverse
+            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in pairwise(at)]
+        return found
+
+    def hats(self, positions: Sequence[int]) -> list[Float]:
+        """Each factor's own block of the hat matrix `A (A^T A)^-1 A^T`."""
+        found = []
+        for chunk in _chunks([int(self.rows[p]) for p in positions]):
+            rows = [slice(self.starts[positions[i]], self.starts[positions[i] + 1]) for i in chunk]
+            A = vstack([self.A[r] for r in rows]).tocsr()
+            hat = A @ self.solve(A.T.toarray())
+            at = np.concatenate([[0], np.cumsum([r.stop - r.start for r in rows])])
+            found += [hat[a:b, a:b].copy() for a, b in pairwise(at)]
+        return found
+
+    def standardised(self, positions: Sequence[int]) -> list[tuple[float, int]]:
+        """Residual of each factor against what all others predict: chi-square and its degrees of freedom.
+
+        The residual's covariance is I - H, with H the factor's block of the hat matrix; directions that the factor
+        determines alone do not count.
+        """
+        found = []
+        for position, hat in zip(positions, self.hats(positions), strict=True):
+            eigenvalues, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
+            free = eigenvalues > DETERMINED
+            along = (vectors.T @ self.b[self.starts[position] : self.starts[position + 1]])[free]
+            found.append((float((along**2 / eigenvalues[free]).sum()), int(free.sum())))
+        return found
 
     def shift(self, C: csr_matrix) -> Shift:
         """Errors of the measurements as further unknowns y: `b = A x + C y`.
@@ -144,8 +179,22 @@ class LinearSystem:
 
         Hutchinson's estimator with fixed random signs, one solution for all groups; reproducible.
         """
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(self.A.shape[0], probes))
+        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(self.b.size, probes))
         hat = (signs * (self.A @ self.solve(self.A.T @ signs))).mean(axis=1)
         shares = np.bincount(np.repeat(group, self.rows), weights=hat, minlength=groups)
-        rows = np.bincount(np.repeat(group, self.rows), minlength=groups)
-        return np.clip(shares, 0.0, rows)
+        rows = np.bincount(np.repeat(group, self.rows), minlength=groups).astype(float)
+        return np.asarray(np.clip(shares, 0.0, rows), np.float64)
+
+
+def _chunks(widths: Sequence[int]) -> Iterator[list[int]]:
+    """Indices in groups of at most `CHUNK` columns together."""
+    group: list[int] = []
+    total = 0
+    for i, width in enumerate(widths):
+        if group and total + width > CHUNK:
+            yield group
+            group, total = [], 0
+        group.append(i)
+        total += width
+    if group:
+        yield group

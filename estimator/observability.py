@@ -53,7 +53,7 @@ def why_no_base(mount: Mount | None, board_known: bool) -> str:
         return "{b} is not observable: the rig has no mount (f_T_b); add the section `mount` to the rig file"
     if not board_known:
         return (
-            f"{{b}} is not observable: board {mount.board} was never seen by the mobile camera well enough to be placed; "
+            f"{{b}} is not observable: board {mount.board} was never seen well enough by the mobile camera; "
             "record a view of the whole board from 1 to 1.5 m, or correct the marker ids in the rig file"
         )
     return "{b} is not observable: nothing ties the Kinect to the mobile camera"

@@ -181,8 +181,9 @@ class Odometry:
         ready = [r for r in rows if int(frame.track_ids[r]) in self._waiting]
         ready = _spread(frame.left_px, ready, room)
         points = self._triangulate(frame, ready)
+        agree = self._agreeing(frame, ready, points, pose)
         for r, c_p in zip(ready, points, strict=True):
-            if c_p is None:
+            if c_p is None or r not in agree:
                 continue
             track = int(frame.track_ids[r])
             first_index, first_frame, first_row = self._waiting.pop(track)
@@ -195,6 +196,38 @@ class Odometry:
                 self._waiting[track] = (index, frame, r)
         alive = {int(t) for t in frame.track_ids}
         self._waiting = {t: w for t, w in self._waiting.items() if t in alive or index - w[0] < 3}
+
+    def _agreeing(self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3) -> set[int]:
+        """Rows whose point, triangulated now, is also where the earlier keyframe saw it, left and right.
+
+        A landmark that starts from a wrong match can lie behind a camera, where its factors say nothing at all. What
+        does not agree waits for another view. The median shift is taken out: it is the guess of the pose that is off.
+        """
+        kept = [(r, c_p) for r, c_p in zip(rows, points, strict=True) if c_p is not None]
+        if not kept:
+            return set()
+        off = np.array([self._earlier_residual(frame, r, pose.transformFrom(c_p)) for r, c_p in kept])
+        off = off - np.nanmedian(off, axis=0)
+        distance = np.linalg.norm(off.reshape(-1, 2, 2), axis=2).max(axis=1)
+        spread = 1.4826 * float(np.nanmedian(distance))
+        sigma = np.array([np.sqrt(np.trace(frame.left_covariance_px2[r]) / 2) for r, _ in kept])
+        limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
+        return {r for (r, _), d, most in zip(kept, distance, limit, strict=True) if d < most}
+
+    def _earlier_residual(self, frame: StereoFrame, row: int, o_p: Float) -> Float:
+        """Pixels of the waiting keyframe less those of a point, left then right, shape (4,); NaN behind a camera."""
+        index, earlier, earlier_row = self._waiting[int(frame.track_ids[row])]
+        o_T_left = self._state.pose(keys.keyframe(index))
+        o_T_right = o_T_left.compose(self._state.pose(keys.extrinsics("m_right")))
+        residual = np.full(4, np.nan)
+        for i, (camera, o_T_c, seen) in enumerate(
+            (("m_left", o_T_left, earlier.left_px), ("m_right", o_T_right, earlier.right_px))
+        ):
+            c_p = o_T_c.transformTo(o_p)
+            if c_p[2] > 0.05:
+                px = self._state.intrinsics(keys.intrinsics(camera)).K() @ c_p
+                residual[2 * i : 2 * i + 2] = seen[earlier_row] - px[:2] / px[2]
+        return residual
 
     def _triangulate(self, frame: StereoFrame, rows: list[int]) -> list[Float | None]:
         """Points in the left camera by the current calibration (linear, two rays), None where too far or behind."""

@@ -36,9 +36,12 @@ def rig_of(log: LogReader, given: Path | None) -> Rig:
 
 
 def optimise(
-    log: Path, rig_file: Path | None = None, between: tuple[tuple[str, str], ...] = (), progress: Progress | None = None,
+    log: Path,
+    rig_file: Path | None = None,
+    between: tuple[tuple[str, str], ...] = (),
+    progress: Progress | None = None,
     command: str = "",
-) -> Result:  # fmt: skip
+) -> Result:
     """The joint estimate of one recording.
 
     Args:

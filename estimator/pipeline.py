@@ -27,9 +27,9 @@ Float = NDArray[np.float64]
 
 KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
-OUTLINE_SPACING_M = 0.05
+OUTLINE_SPACING_M = 0.12
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.01, 0.05, 0.015)
+OUTLINE_PRIOR = (0.006, 0.02, 0.008)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
@@ -172,8 +172,8 @@ class Pipeline:
             if not point.known:
                 pick = point.held[-1][1]
                 raise LogError(
-                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no second "
-                    "view; pick the point again from another place"
+                    f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {name} in {pick.camera} has no depth and no "
+                    "second view; pick the point again from another place"
                 )
         self._check_open_picks()
 

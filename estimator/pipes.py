@@ -24,8 +24,8 @@ MINIMUM_PARALLAX_RAD = 0.03
 WIDE_RADIUS_M = (0.05, 0.04)
 """Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
 GAUGE_HALF_LENGTH_M = 0.25
-EDGE_FLOOR_PX = 0.08
-"""Blur and shading move an edge by about this much from its place, the same for all pixels of one view."""
+EDGE_FLOOR_PX = 0.3
+"""Shading and a background of like brightness move an edge: rms on rendered recordings, beyond what its fit says."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,8 @@ def radius95(covariance: Float) -> float:
     sigma = np.sqrt(variances)
     upper = float(sigma[0] * np.sqrt(chi2.ppf(0.95, 3)))
     lower = float(sigma[0] * 1.9)
-    return float(brentq(lambda r: _inside(r, sigma) - 0.95, lower, upper * 1.0001, xtol=1e-9 + 1e-6 * upper))
+    root = brentq(lambda r: _inside(r, sigma) - 0.95, lower, upper * 1.0001, xtol=1e-9 + 1e-6 * upper)
+    return float(root)  # pyright: ignore[reportArgumentType]  # without full_output it is a number
 
 
 def _inside(radius: float, sigma: Float) -> float:

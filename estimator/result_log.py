@@ -1,8 +1,11 @@
 """The result as an MCAP log of its own: poses, points, ellipsoids, diagnostics, and the whole result as attachment."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ..io.build import (
     point_with_covariance_array,
@@ -16,6 +19,7 @@ from .result import PoseEstimate, Result
 from .result_json import to_json
 
 POSE = "geometry_msgs/msg/PoseStamped"
+Level = Literal["ok", "warn", "error", "stale"]
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
@@ -48,18 +52,17 @@ def _write_poses(sink: McapSink, result: Result) -> None:
 
 
 def _write_pose(sink: McapSink, pose: PoseEstimate, stamp_ns: int) -> None:
-    name = pose.name if pose.name in ("m", "b") else f"f/{pose.name}"
-    sink.write(f"/estimate/pose/{name}", POSE, pose_stamped(stamp_ns, pose.parent, pose.matrix), stamp_ns)
+    sink.write(f"/estimate/pose/{pose.name}", POSE, pose_stamped(stamp_ns, pose.parent, pose.matrix), stamp_ns)
     if pose.covariance is not None:
         message = pose_with_covariance_stamped(stamp_ns, pose.parent, pose.matrix, pose.covariance)
-        sink.write(f"/estimate/pose_with_covariance/{name}", POSE_COVARIANCE, message, stamp_ns)
+        sink.write(f"/estimate/pose_with_covariance/{pose.name}", POSE_COVARIANCE, message, stamp_ns)
 
 
 def _write_points(sink: McapSink, result: Result) -> None:
     if not result.points:
         return
     stamp, frame = result.end_ns, "b"
-    named = {p.id: (p.position_m, p.covariance_m2) for p in result.points}
+    named: dict[str, tuple[ArrayLike, ArrayLike]] = {p.id: (p.position_m, p.covariance_m2) for p in result.points}
     pairs = list(named.values())
     array = "surecut_msgs/msg/PointWithCovarianceArray"
     sink.write("/estimate/points", array, point_with_covariance_array(stamp, frame, named), stamp)
@@ -70,20 +73,20 @@ def _write_points(sink: McapSink, result: Result) -> None:
 
 def _write_diagnostics(sink: McapSink, result: Result) -> None:
     consistency = result.consistency
-    rows = []
+    rows: list[tuple[Level, str, str, dict[str, str]]] = []
     for family in consistency.by_family:
         ratio = family.chi2 / family.dof if family.dof > 0 else float("nan")
-        level = "warn" if ratio > family.upper else "ok"
+        level: Level = "warn" if ratio > family.upper else "ok"
         values = {"chi2": f"{family.chi2:.3f}", "dof": f"{family.dof:.1f}", "limit": f"{family.upper:.3f}"}
         values["residuals"] = str(family.residuals)
         rows.append((level, f"residuals/{family.family}", f"chi2/dof {ratio:.2f}", values))
-    overall = "ok" if consistency.passed else "error"
+    overall: Level = "ok" if consistency.passed else "error"
     text = "consistent" if consistency.passed else "; ".join(consistency.reasons)
     rows.append((overall, "health", text, {}))
     sink.write(
         "/estimate/health", "diagnostic_msgs/msg/DiagnosticArray", diagnostic_array(result.end_ns, rows), result.end_ns
     )
-    severity = {"info": "ok", "warning": "warn", "error": "error"}
+    severity: dict[str, Level] = {"info": "ok", "warning": "warn", "error": "error"}
     for event in result.events:
         values = {k: f"{v:.6g}" for k, v in event.values.items()}
         status = diagnostic_array(event.stamp_ns, [(severity[event.severity], event.kind, event.text, values)])
@@ -96,8 +99,6 @@ def _write_diagnostics(sink: McapSink, result: Result) -> None:
 
 def tum_text(result: Result) -> str:
     """`o_T_m` in TUM format: time [s], translation [m], quaternion x y z w; one line per frame."""
-    from scipy.spatial.transform import Rotation
-
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for pose in result.trajectory:
         q = Rotation.from_matrix(pose.matrix[:3, :3]).as_quat()

@@ -1,6 +1,5 @@
 """The front ends of one run: opened when their camera's calibration is known, fed with images, giving measurements."""
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import cast
@@ -27,7 +26,8 @@ Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
 DEPTH_FRAMES = 10
-"""Depth images of a still machine that are averaged before surfaces are read from them."""
+DEPTH_WINDOW_NS = 2_000_000_000
+"""Depth images of a still machine that are averaged before surfaces are read from them: so many, or so long."""
 MATCH_SIGMA_PX = 0.5
 """Disparity error of semi-global matching on a window's median (OpenCV, one pixel steps interpolated to 1/16)."""
 
@@ -63,7 +63,7 @@ class Sensors:
         self._markers: dict[str, MarkerFrontEnd] = {}
         self._outlines: dict[str, OutlineFinder] = {}
         self._clouds: CloudFrontEnd | None = None
-        self._depths: deque[NDArray[np.float32]] = deque(maxlen=DEPTH_FRAMES)
+        self._depths: list[tuple[int, NDArray[np.float32]]] = []
         self._unmatched = 0
         """Pairs from the start on that had hardly a feature in common."""
         self.rejected: list[Rejection] = []
@@ -83,7 +83,8 @@ class Sensors:
         info = self.rig.cameras.m_right.info_topic
         if baseline < 0 or (baseline == 0 and left > 0):
             raise LogError(
-                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; exchange their topics in the rig file"
+                f"{info}: the baseline is {baseline or -left:.3f} m: left and right are swapped; "
+                "exchange their topics in the rig file"
             )
         if baseline == 0:
             raise LogError(f"{info}: no baseline in P[3]; give stereo.m_left_T_m_right in the rig file")
@@ -123,7 +124,8 @@ class Sensors:
         if name not in self.cameras:
             topic = getattr(self.rig.cameras, name).info_topic
             raise LogError(
-                f"{topic}: no calibration of {name} before its first image; record camera_info or correct the topic in the rig file"
+                f"{topic}: no calibration of {name} before its first image; "
+                "record camera_info or correct the topic in the rig file"
             )
         return self.cameras[name]
 
@@ -132,7 +134,8 @@ class Sensors:
         if image.shape[:2] != (camera.height, camera.width):
             size = f"{image.shape[1]}x{image.shape[0]}"
             raise LogError(
-                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; record the camera_info that belongs to the images"
+                f"{topic}: images are {size}, the calibration is for {camera.width}x{camera.height}; "
+                "record the camera_info that belongs to the images"
             )
 
     def depth_under(self, pick: Pick, pair: PairImages) -> tuple[float, float] | None:
@@ -181,10 +184,10 @@ class Sensors:
             camera = self._camera("b_depth")
             self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)
             self._clouds = CloudFrontEnd(camera, self.rig.kinect.model)
-        self._depths.append(depth_m)
-        if len(self._depths) < DEPTH_FRAMES:
+        self._depths.append((stamp_ns, depth_m))
+        if len(self._depths) < DEPTH_FRAMES and stamp_ns - self._depths[0][0] < DEPTH_WINDOW_NS:
             return None
-        mean = average_depth(np.stack(self._depths))
+        mean = average_depth(np.stack([depth for _, depth in self._depths]))
         count = len(self._depths)
         self._depths.clear()
         return self._clouds.process(stamp_ns, mean, count)
@@ -207,7 +210,8 @@ class Sensors:
         u, v = (float(x) for x in body.px)
         if not (-0.5 <= u <= camera.width - 0.5 and -0.5 <= v <= camera.height - 0.5):
             raise LogError(
-                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of {body.camera}; pick again"
+                f"{where} lies at ({u:.1f}, {v:.1f}) px, outside the {camera.width}x{camera.height} image of "
+                f"{body.camera}; pick again"
             )
         if body.role not in ("grasp", "cut", "other"):
             raise LogError(f"{where} has role {body.role!r}; roles are grasp, cut and other")

@@ -47,9 +47,7 @@ class Sides:
         self._before += int((clear & (depth > 0)).sum())
         self._behind += int((clear & (depth < 0)).sum())
         if self._behind >= ENOUGH and self._behind > 4 * self._before:
-            raise swapped(
-                self._rig, f"at {pairs[0][0].stamp_ns} ns: {self._behind} marker corners lie behind the camera"
-            )
+            raise swapped(self._rig, f"at {pairs[0][0].stamp_ns} ns: {self._behind} corners lie behind the camera")
 
 
 def swapped(rig: Rig, evidence: str) -> LogError:

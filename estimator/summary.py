@@ -15,7 +15,6 @@ from .consistency import family_tests, judge, prior_tests
 from .correlation import Active, inflated_system
 from .engine import Engine
 from .marker_points import parse_point
-from .observability import determined
 from .odometry import FAMILY as ODOMETRY
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
@@ -42,11 +41,7 @@ class Summary:
         self._solution = solution
         off = set(solution.outliers)
         self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        graph = gtsam.NonlinearFactorGraph()
-        for _, factor, _ in self._active:
-            graph.add(factor)
-        self._graph = graph
-        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
+        self._system = inflated_system(self._active, solution.values, ODOMETRY)
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -161,10 +156,8 @@ class Summary:
 
     def _keyframe_covariances(self) -> list[Float]:
         """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
-        with determined():
-            marginals = gtsam.Marginals(self._graph, self._values)
         count = self._engine.odometry.last_keyframe + 1
-        return [self._inflation * marginals.marginalCovariance(keys.keyframe(i)) for i in range(count)]
+        return self._system.marginals([keys.keyframe(i) for i in range(count)])
 
     # Calibration and distances --------------------------------------------------------------------------------
 

@@ -17,6 +17,8 @@ from .graph import Record, State, Update
 Float = NDArray[np.float64]
 
 FAMILY = "depth cloud"
+SAME_SIDE_COSINE = 0.1
+"""Between a surface's normal and the mobile camera's view of it: beyond, the camera may see another face."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +89,9 @@ class Surfaces:
         offset, scale = self._state.vector(keys.DEPTH)
         measured = corrected(points, -offset, -scale)
         matches, refusals = self._associate(measured, sigma, self.cloud)
+        seen_from = o_T_b.transformTo(camera.translation())
+        matches, behind = _same_side(matches, seen_from)
+        refusals = [*refusals, *behind]
         for match in matches[: self._settings.most - len(self._laid)]:
             self._lay_one(update, rows[match.landmark], match, base)
         for row, reason, value, limit in refusals:
@@ -122,6 +127,26 @@ class Surfaces:
         update.add(factor, Record(FAMILY, "landmarks on surfaces", self.cloud.stamp_ns, what))
         self._laid.add(track)
         self.refused.pop(track, None)
+
+
+def _same_side(
+    matches: list[PlaneMatch], seen_from: Float
+) -> tuple[list[PlaneMatch], list[tuple[int, str, float, float]]]:
+    """Only what the mobile camera sees from the Kinect's side: the back of a thin panel is another surface.
+
+    Args:
+        seen_from: the mobile camera in {b}, shape (3,).
+    """
+    good: list[PlaneMatch] = []
+    refused: list[tuple[int, str, float, float]] = []
+    for match in matches:
+        ray = seen_from - match.point_m
+        cosine = float(match.normal @ ray / np.linalg.norm(ray))
+        if cosine > SAME_SIDE_COSINE:
+            good.append(match)
+        else:
+            refused.append((match.landmark, "seen from the other side; cosine", cosine, SAME_SIDE_COSINE))
+    return good, refused
 
 
 def lay_on_surfaces(

@@ -29,7 +29,7 @@ def cal3(camera: CameraModel) -> gtsam.Cal3DS2:
 
 
 def intrinsics_covariance(camera: CameraModel, settings: Camera) -> Float:
-    """Covariance of (fx, fy, skew, cx, cy, k1, k2, p1, p2), shape (9, 9): one common relative error of the focal length.
+    """Covariance of (fx, fy, skew, cx, cy, k1, k2, p1, p2), shape (9, 9); fx and fy share their relative error.
 
     k and p are what the given lens model leaves over (radial and tangential, Brown 1966), at the normalised radius 1.
     """

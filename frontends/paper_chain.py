@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
 from ..factors.measurements import MarkerSighting
+from ..factors.rig import Board
+from .fiducials.dictionaries import marker_dictionary
+from .undistort import undistort
 
 Float = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -114,3 +117,26 @@ def _rectified_pixel(raw_px: Float, camera: CameraModel) -> tuple[float, float]:
         D = None if camera.distortion_model == "none" else camera.D
         pixel = cv2.undistortPoints(point, camera.K, D, R=camera.rectification, P=camera.K)
     return float(pixel[0, 0, 0]), float(pixel[0, 0, 1])
+
+
+def plain_sightings(stamp_ns: int, image: Image, board: Board, camera: CameraModel) -> list[MarkerSighting]:
+    """A board's markers as OpenCV's ArUco module finds them by default, without refinement, as the paper's system did.
+
+    Args:
+        image: grey, shape (height, width), of the left camera.
+
+    Returns:
+        Sightings; their covariance, which the chain does not use, is that of a pixel.
+    """
+    dictionary = marker_dictionary(board.dictionary)
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary.opencv).detectMarkers(image)
+    wanted = {marker.id for marker in board.markers}
+    order = list(dictionary.from_opencv)
+    found = []
+    for quad, marker in zip(corners, [] if ids is None else ids.ravel(), strict=True):
+        if int(marker) in wanted:
+            raw = np.asarray(quad, float).reshape(4, 2)[order]
+            ideal, _ = undistort(camera, raw)
+            noise = np.broadcast_to(np.eye(2), (4, 2, 2))
+            found.append(MarkerSighting(stamp_ns, "m_left", board.id, int(marker), ideal, noise, raw))
+    return found

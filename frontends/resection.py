@@ -36,7 +36,7 @@ def camera_pose(points_m: Float, px: Float, K: Float, guess: Float | None = None
     )
     if not found or inliers is None or len(inliers) < 4:
         return None
-    index = inliers.ravel()
+    index = np.asarray(inliers, np.int64).ravel()
     rotation, translation = cv2.solvePnPRefineLM(points_m[index], px[index], K, None, rotation, translation)
     c_T_o = np.eye(4)
     c_T_o[:3, :3] = cv2.Rodrigues(rotation)[0]
@@ -46,11 +46,11 @@ def camera_pose(points_m: Float, px: Float, K: Float, guess: Float | None = None
         return None
     pixel = c_p @ K.T
     error = float(np.median(np.linalg.norm(pixel[:, :2] / pixel[:, 2:] - px, axis=1)))
-    return np.linalg.inv(c_T_o), error
+    return np.asarray(np.linalg.inv(c_T_o), np.float64), error
 
 
 def _vectors(guess: Float | None) -> tuple[Float, Float]:
     if guess is None:
         return np.zeros(3), np.zeros(3)
     c_T_o = np.linalg.inv(guess)
-    return cv2.Rodrigues(c_T_o[:3, :3])[0], c_T_o[:3, 3].copy()
+    return np.asarray(cv2.Rodrigues(c_T_o[:3, :3])[0], np.float64), np.asarray(c_T_o[:3, 3], np.float64)

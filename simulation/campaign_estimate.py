@@ -2,10 +2,10 @@
 
 from ..estimator.result import Result
 from ..estimator.run import estimate
+from ..estimator.surfaces import lay_on_surfaces
 from .measurement_level import Run
-from .measurement_level_association import nearest_plane
 
 
 def estimate_run(run: Run) -> Result:
     """The estimate of a drawn run; raises SurecutError where the measurements determine nothing."""
-    return estimate(run.measurements, run.rig, run.cameras, nearest_plane)
+    return estimate(run.measurements, run.rig, run.cameras, lay_on_surfaces)

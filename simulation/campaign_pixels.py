@@ -1,6 +1,5 @@
 """One run at pixel level: render a recording, estimate from it as from any other, and read its truth afterwards."""
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -36,15 +35,15 @@ def run_pixels(number: int, scenario: Mapping[str, Any]) -> Row:
 
 def row_of_log(number: int, name: str, log: Path) -> Row:
     """Estimate of a simulated log and its errors."""
-    begin = time.perf_counter()
+    watch = Stopwatch()
     try:
-        result = optimise(log)
+        with watch("estimate"):
+            result = optimise(log)
     except SurecutError as error:
         return failed_row(number, name, str(error))
-    seconds = time.perf_counter() - begin
     truth = truth_of_log(log)
     row = row_of(number, name, result, evaluate(result, truth))
-    row["seconds"] = seconds
+    row["seconds"] = watch.seconds["estimate"]
     row["chain"] = chain_errors_of_log(log, truth)
     return row
 

@@ -41,10 +41,12 @@ def failed_row(number: int, scenario: str, reason: str) -> Row:
 
 def quantities_of(row: Row) -> list[Quantity]:
     """The quantities of a row, as they were before JSON."""
-    return [
-        Quantity(**{key: math.nan if value is None and key != "error_rad" else value for key, value in one.items()})
-        for one in row["quantities"]
-    ]
+    return [Quantity(**_numbers(one)) for one in row["quantities"]]
+
+
+def _numbers(one: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no NaN: null stands for it, but where null is meant."""
+    return {key: math.nan if value is None and key != "error_rad" else value for key, value in one.items()}
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:

@@ -71,8 +71,8 @@ class Markers(Section):
 class Clouds(Section):
     """Kinect depth images. 0 frames: no Kinect."""
 
-    frames: Count = 6
-    points: Count = 400
+    frames: Count = 2
+    points: Count = 3000
 
 
 class Picks(Section):

@@ -128,7 +128,7 @@ def shade(scene, rays):
 
 def render(scene, camera, rng, oversample=4):
     """Grey image uint8 of the camera, raw (distorted)."""
-    from surecut.frontends.rays import normalised
+    from surecut.frontends.undistort import undistort
 
     o = (np.arange(oversample) + 0.5) / oversample - 0.5
     u = (np.arange(camera.width)[:, None] + o).ravel()
@@ -137,7 +137,8 @@ def render(scene, camera, rng, oversample=4):
     if camera.distortion_model == "none":
         xy = np.column_stack(((uu.ravel() - camera.cx) / camera.fx, (vv.ravel() - camera.cy) / camera.fy))
     else:
-        xy = normalised(np.column_stack((uu.ravel(), vv.ravel())), camera)
+        ideal = undistort(camera, np.column_stack((uu.ravel(), vv.ravel())))[0]
+        xy = (ideal - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     rays = np.column_stack((xy, np.ones(len(xy))))
     fine = shade(scene, rays).reshape(camera.height, oversample, camera.width, oversample)
     image = fine.mean(axis=(1, 3)) * scene.gain

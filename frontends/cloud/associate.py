@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ...factors.measurements import CloudFrame
 
@@ -94,10 +94,11 @@ class _Neighbourhood:
 
     @classmethod
     def find(cls, landmarks: Float, sigma: Float, cloud: CloudFrame, config: AssociationConfig) -> "_Neighbourhood":
-        tree = cKDTree(cloud.points_m)
+        tree = KDTree(cloud.points_m)
         neighbours = min(_NEIGHBOURS, len(cloud.points_m))
-        distance, index = tree.query(landmarks, k=neighbours, distance_upper_bound=1.5 * config.largest_radius_m)
-        pairs, _ = tree.query(cloud.points_m, k=2)
+        found = tree.query(landmarks, k=neighbours, distance_upper_bound=1.5 * config.largest_radius_m)
+        distance, index = np.asarray(found[0]), np.asarray(found[1], np.int64)
+        pairs = np.asarray(tree.query(cloud.points_m, k=2)[0])
         gaps = np.append(pairs[:, 1], np.nan)
         spacing = np.nan_to_num(gaps[index[:, 0]], nan=config.largest_radius_m)
         radius = np.clip(np.maximum(2.5 * spacing, 2.0 * sigma), config.smallest_radius_m, config.largest_radius_m)
@@ -178,7 +179,7 @@ def _depth_step(landmarks: Float, sigma: Float, near: _Neighbourhood, plane: _Pl
     depth = np.maximum(landmarks[:, 2], 0.1)
     directions = cloud.points_m[:, :2] / cloud.points_m[:, 2:]
     neighbours = min(_NEIGHBOURS, len(directions))
-    distance, index = cKDTree(directions).query(landmarks[:, :2] / depth[:, None], k=neighbours)
+    distance, index = KDTree(directions).query(landmarks[:, :2] / depth[:, None], k=neighbours)
     reach = (2.0 * sigma + 2.0 * near.spacing) / depth
     points = cloud.points_m[index]
     away = np.abs(np.einsum("nki,ni->nk", points - plane.centre[:, None], plane.normal))

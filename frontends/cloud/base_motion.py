@@ -24,7 +24,8 @@ class MotionConfig:
     """The base stands again after so long without motion."""
     voxel_m: float = 0.1
     """Of KISS-ICP's map, which carries the guess through the motion."""
-    registration: RegistrationConfig = RegistrationConfig(reaches_m=(0.3, 0.15, 0.08))
+    reaches_m: tuple[float, ...] = (0.3, 0.15, 0.08)
+    """Search radii of the registration between stations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,8 @@ class BaseMotion:
         self._moving = _Moving(start_ns, odometry)
 
     def _while_moving(self, cloud: CloudFrame) -> Station | None:
-        assert self._moving is not None and self._reference is not None
+        assert self._moving is not None
+        assert self._reference is not None
         self._moving.odometry.register_frame(cloud.points_m, np.zeros(len(cloud.points_m)))
         calm = self._moving.calm
         if calm is None or self._moved(calm[1], cloud):
@@ -116,7 +118,9 @@ class BaseMotion:
             return None
         if cloud.stamp_ns - calm[0].stamp_ns < self._config.still_ns:
             return None
-        return self._begin(calm[0], register(self._reference, calm[0], calm[2], self._config.registration))
+        return self._begin(
+            calm[0], register(self._reference, calm[0], calm[2], RegistrationConfig(reaches_m=self._config.reaches_m))
+        )
 
 
 def _odometry(voxel_m: float) -> Any:

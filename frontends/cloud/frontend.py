@@ -60,8 +60,8 @@ class CloudFrontEnd:
         self._stride = max(3, int(np.ceil(np.sqrt(camera.width * camera.height / self._config.samples))))
         self._window = self._stride | 1
         rays = pixel_rays(camera)
-        self._x = self._tiles(rays[..., 0].astype(np.float32))
-        self._y = self._tiles(rays[..., 1].astype(np.float32))
+        self._inside = np.isfinite(rays).all(axis=2)
+        self._x, self._y = (self._tiles(np.nan_to_num(rays[..., i]).astype(np.float32)) for i in (0, 1))
 
     def process(self, stamp_ns: int, depth_m: Float32, averaged: int = 1) -> CloudFrame:
         """Surface samples of one depth image.
@@ -76,10 +76,10 @@ class CloudFrontEnd:
         if depth_m.shape != shape:
             raise ValueError(f"depth image of {depth_m.shape}, the camera {self._camera.name} has {shape}")
         depth, good = trusted_pixels(depth_m, self._camera, self._noise)
-        fit = self._fit(depth, good)
+        fit = self._fit(depth, good & self._inside)
         return self._samples(stamp_ns, fit, averaged)
 
-    def _tiles(self, image: NDArray[np.generic]) -> NDArray[np.generic]:
+    def _tiles(self, image: Float32) -> Float32:
         """(n, window * window) copies of the windows, at the stride."""
         views = np.lib.stride_tricks.sliding_window_view(image, (self._window, self._window))
         views = views[:: self._stride, :: self._stride]
@@ -127,7 +127,7 @@ def trusted_pixels(depth_m: Float32, camera: CameraModel, noise: DepthNoise) -> 
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     near, far = cv2.erode(depth, cross), cv2.dilate(depth, cross)
     steepest = np.float32(np.tan(np.deg2rad(80.0)) * 2.0 / camera.fx)
-    limit = 3 * noise.axial(far, 0.0) + steepest * far
+    limit = 3 * noise.axial(np.asarray(far, np.float64), 0.0) + steepest * far
     edge = ((far - near) > limit).astype(np.uint8)
     grow = 2 * int(np.ceil(noise.lateral_px)) - 1
     edge = cv2.dilate(edge, np.ones((grow, grow), np.uint8)) if grow > 1 else edge

@@ -1,11 +1,11 @@
 """Published noise of depth cameras: standard deviation along the ray per pixel, and what does not average out.
 
-- Kinect v1: Nguyen, Izadi, Lovell, "Modeling Kinect Sensor Noise for Improved 3D Reconstruction and Tracking" (2012);
+- Kinect v1: Nguyen, Izadi, Lovell, "Modeling Kinect Sensor Noise for Improved 3D Reconstruction" (2012);
   depth step: Khoshelham and Oude Elberink, Sensors 12 (2012) 1437.
 - Kinect v2: Fankhauser et al., "Kinect v2 for Mobile Robot Navigation" (ICAR 2015).
 - Azure Kinect: as v2; Kurillo et al., Sensors 22 (2022) 2469 find the two comparable below 2.5 m.
-- RealSense D400: stereo, sigma_z = z^2 sigma_d / (f b) with 0.08 px (Intel's figure for textured walls), f 640 px at 848
-  columns and b 50 mm; disparities come in steps of 1/32 px.
+- RealSense D400: stereo, sigma_z = z^2 sigma_d / (f b) with 0.08 px (Intel's figure for textured walls), f 640 px at
+  848 columns and b 50 mm; disparities come in steps of 1/32 px.
 """
 
 from collections.abc import Callable

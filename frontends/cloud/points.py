@@ -2,7 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ...factors.measurements import CloudFrame
 from .noise import DepthModel, depth_noise
@@ -75,7 +75,7 @@ def local_planes(points: Float, at: Float, neighbours: int) -> tuple[Float, Floa
         Centroids (m, 3), unit normals of either sign (m, 3), root mean square distance from the plane (m,).
     """
     neighbours = min(neighbours, len(points))
-    _, index = cKDTree(points).query(at, k=neighbours)
+    _, index = KDTree(points).query(at, k=neighbours)
     near = points[np.reshape(index, (len(at), neighbours))]
     centre = near.mean(axis=1)
     offset = near - centre[:, None]

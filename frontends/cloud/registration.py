@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ...factors.measurements import CloudFrame
+from ..covariance import larger
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -55,7 +56,7 @@ class SurfaceMap:
 
     def __init__(self, points: Float, normals: Float, sigma: Float, bias: Float) -> None:
         self.points, self.normals, self.sigma, self.bias = points, normals, sigma, bias
-        self.tree = cKDTree(points)
+        self.tree = KDTree(points)
 
     @classmethod
     def of(cls, cloud: CloudFrame) -> "SurfaceMap":
@@ -65,7 +66,7 @@ class SurfaceMap:
         """This map with a cloud's samples added where it has none within `voxel_m` of a like normal."""
         points = cloud.points_m @ map_T_cloud[:3, :3].T + map_T_cloud[:3, 3]
         normals = cloud.normals @ map_T_cloud[:3, :3].T
-        distance, index = self.tree.query(points, distance_upper_bound=voxel_m)
+        distance, index = (np.asarray(a) for a in self.tree.query(points, distance_upper_bound=voxel_m))
         known = np.isfinite(distance)
         known[known] = (normals[known] * self.normals[index[known]]).sum(axis=1) > 0.8
         new = ~known
@@ -145,7 +146,7 @@ class _Pairs:
         rotation = pose[:3, :3]
         points = cloud.points_m @ rotation.T + pose[:3, 3]
         normals = cloud.normals @ rotation.T
-        distance, index = target.tree.query(points, distance_upper_bound=reach)
+        distance, index = (np.asarray(a) for a in target.tree.query(points, distance_upper_bound=reach))
         found = np.nonzero(np.isfinite(distance))[0]
         partner = index[found]
         alike = (normals[found] * target.normals[partner]).sum(axis=1) > np.cos(agreement)
@@ -156,7 +157,7 @@ class _Pairs:
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         residual = ((points[found] - target.points[partner]) * normal).sum(axis=1)
         local = normal @ rotation
-        jacobian = np.hstack((np.cross(cloud.points_m[found], local), local))
+        jacobian = np.hstack((np.asarray(np.cross(cloud.points_m[found], local), np.float64), local))
         sigma = np.hypot(cloud.sigma_m[found], target.sigma[partner])
         scale = max(1.4826 * float(np.median(np.abs(residual) / sigma)), 0.5)
         ratio = residual / (2.4 * scale * sigma)
@@ -174,7 +175,7 @@ class _Pairs:
 def _summary(pose: Float, pairs: _Pairs, count: int, converged: bool, config: RegistrationConfig) -> Registration:
     normal = pairs.jacobian.T @ (pairs.weight[:, None] * pairs.jacobian)
     prior = np.eye(6) / config.weakest_sigma_m**2
-    inverse = np.linalg.inv(normal + prior)
+    inverse = np.asarray(np.linalg.inv(normal + prior), np.float64)
     # Depth errors are common to a surface: each stretch of 0.25 m of the scene with a like normal is one observation.
     facing = np.argmax(np.abs(pairs.jacobian[:, 3:]), axis=1)
     cells = np.column_stack((np.floor(pairs.place / 0.25).astype(int), facing))
@@ -186,7 +187,7 @@ def _summary(pose: Float, pairs: _Pairs, count: int, converged: bool, config: Re
     common = np.zeros((number, 6))
     np.add.at(common, patch.ravel(), (pairs.weight * pairs.bias)[:, None] * pairs.jacobian)
     bias = inverse @ (common.T @ common) @ inverse
-    covariance = _larger(inverse, sandwich + bias + _smooth(pairs, inverse, config.smooth_share))
+    covariance = larger(inverse, sandwich + bias + _smooth(pairs, inverse, config.smooth_share))
     values, vectors = np.linalg.eigh(covariance)
     effective = len(pairs.residual) * 6 / max(float(np.trace(np.linalg.solve(inverse, covariance))), 6.0)
     return Registration(
@@ -209,14 +210,6 @@ def _smooth(pairs: _Pairs, inverse: Float, share: float) -> Float:
     scores = np.zeros((int(part.max()) + 1, 6))
     np.add.at(scores, part.ravel(), (pairs.weight * along_ray * share * np.sqrt(2.0))[:, None] * pairs.jacobian)
     return inverse @ (scores.T @ scores) @ inverse
-
-
-def _larger(a: Float, b: Float) -> Float:
-    """A covariance that is no smaller than either in any direction."""
-    root = np.linalg.cholesky(a)
-    inner = np.linalg.solve(root, np.linalg.solve(root, b).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
 
 
 def _lost(pose: Float, config: RegistrationConfig) -> Registration:

@@ -27,11 +27,11 @@ Window = tuple[int, int, int, int]
 Windows = Sequence[Window]
 
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-_MAX_PIXELS = 512
+_MAX_PIXELS = 420
 """Pixels per marker; more cost time and give nothing that the model's own error does not swamp."""
 _FEW_PIXELS = 200
 """Of them, those that the first steps use."""
-_COARSE_LATTICE, _LATTICE = 800, 3000
+_COARSE_LATTICE, _LATTICE = 800, 2500
 """Pixels of a marker that are looked at to choose from."""
 _COARSE_REACH_PX = 3.0
 _REACH_PX, _REACH_BLURS = 0.7, 2.2
@@ -47,7 +47,7 @@ _CAUTIOUS_AFTER, _CAUTION = 3, 0.6
 _BLOCK_PX, _BLOCK_PIXELS = 3, 8
 """Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 _BLUR_STEP_PX2 = 2.0
-_COARSE_PX, _FINE_PX = 0.15, 0.012
+_COARSE_PX, _FINE_PX = 0.25, 0.012
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
 _COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
 """Edges may be that far off, beside the noise, before their pixels lose weight, in either stage."""
@@ -281,19 +281,34 @@ def _near_edges(
     corners = corners[:, :2] / corners[:, 2:]
     u = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
     v = float(np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1])) / 2
-    near = _edge_within(a, b, pattern, reach_px * cells / u) | _edge_within(b, a, pattern.T, reach_px * cells / v)
+    in_x, in_y = _edges(pattern)
+    near = _edge_within(a, b, in_x, reach_px * cells / u) | _edge_within(b, a, in_y, reach_px * cells / v)
     index = (rows * width + columns)[inside][near]
     scatter = (index * 2654435761) % 4294967296
-    return index[np.argsort(scatter)[: choice.most]]
+    if len(index) <= choice.most:
+        return index
+    return index[np.argpartition(scatter, choice.most)[: choice.most]]
 
 
-def _edge_within(across: Float, along: Float, pattern: Float, reach_cells: float) -> NDArray[np.bool_]:
+def _edge_within(across: Float, along: Float, edges: NDArray[np.bool_], reach_cells: float) -> NDArray[np.bool_]:
     """Whether the grid line nearest in `across` is an edge of the pattern there, and within reach."""
-    extended = np.pad(pattern, 1, constant_values=1.0)
-    edges = np.abs(np.diff(extended, axis=0)) > 0.5
-    line = np.clip(np.rint(across), 0, len(pattern)).astype(int)
-    cell = np.clip(np.floor(along), -1, len(pattern)).astype(int) + 1
+    line = np.rint(across).astype(np.intp)
+    cell = np.floor(along).astype(np.intp) + 1
     return edges[line, cell] & (np.abs(across - line) < reach_cells)
+
+
+def _edges(pattern: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which pieces of the grid lines part black from white: [line in x, cell in y] and [line in y, cell in x].
+
+    Lines and cells count from one cell outside the border on the cells' side; a line outside (index -1) is no edge.
+    """
+    n = len(pattern)
+    extended = np.ones((n + 2, n + 2))
+    extended[1:-1, 1:-1] = pattern
+    across, along = np.zeros((n + 3, n + 2), bool), np.zeros((n + 3, n + 2), bool)
+    across[: n + 1] = np.diff(extended, axis=0) != 0
+    along[: n + 1] = np.diff(extended.T, axis=0) != 0
+    return across, along
 
 
 def surroundings(corners: Float, cells: int, size: tuple[int, int]) -> Window:

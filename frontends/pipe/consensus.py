@@ -29,7 +29,7 @@ class Axis:
         if np.linalg.norm(towards) < 1e-6:
             towards = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
         first = towards / np.linalg.norm(towards)
-        return cls(point, direction, np.array([first, np.cross(direction, first)]), float(radius))
+        return cls(point, direction, np.array([first, np.cross(direction, first)], np.float64), float(radius))
 
     def residuals(self, points: Float) -> tuple[Float, Float]:
         """Distance from the surface (n,), and derivatives by (two shifts, two tilts, radius) (n, 5)."""
@@ -140,7 +140,7 @@ def _distinct(points: Float, point: Float, direction: Float, radius: Float, scor
     chosen: list[Axis] = []
     middle = np.median(points, axis=0)
     for i in np.argsort(-score):
-        axis = Axis.of(point[i], direction[i], radius[i], middle)
+        axis = Axis.of(point[i], direction[i], float(radius[i]), middle)
         if all(axis.angle_to(other) > 0.15 or abs(axis.radius - other.radius) > 0.2 * other.radius for other in chosen):
             chosen.append(axis)
         if len(chosen) == count:

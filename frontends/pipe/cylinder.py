@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ...factors.measurements import Rejection
 from ..cloud.points import local_planes, spread_evenly
+from ..covariance import larger
 from .consensus import Axis, candidates
 
 Float = NDArray[np.float64]
@@ -184,7 +185,7 @@ def _covariance(
         if filled < 8:
             break
         sandwich = inverse @ (scores.T @ scores) @ inverse * filled / max(filled - 5, 1)
-        best = _larger(best, sandwich)
+        best = larger(best, sandwich)
     ratio = np.trace(np.linalg.solve(best, inverse)) / 5
     return best, float(inlier.sum() * ratio)
 
@@ -192,14 +193,6 @@ def _covariance(
 def _bins(values: Float, count: int) -> NDArray[np.int64]:
     low, high = float(values.min()), float(values.max())
     return np.minimum(((values - low) / max(high - low, 1e-9) * count).astype(int), count - 1)
-
-
-def _larger(a: Float, b: Float) -> Float:
-    """A covariance that is no smaller than either in any direction."""
-    root = np.linalg.cholesky(a)
-    inner = np.linalg.solve(root, np.linalg.solve(root, b).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
 
 
 def _halves(

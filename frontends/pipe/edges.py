@@ -93,13 +93,15 @@ def _slopes(patch: Float32, centre: Float, theta: Float, reach: int) -> Float32:
     u = np.float32(centre[0]) + across * cosine - along[:, None] * sine
     v = np.float32(centre[1]) + across * sine + along[:, None] * cosine
     flat = (-1, len(across))
-    turned = cv2.remap(patch, u.reshape(flat), v.reshape(flat), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, np.nan)
+    turned = cv2.remap(
+        patch, u.reshape(flat), v.reshape(flat), cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan,) * 4
+    )
     means = turned.reshape(len(theta) * _STRETCHES, _STRETCH, len(across)).mean(axis=1)
     taps = np.arange(-4, 5, dtype=np.float32)
     kernel = taps * np.exp(-0.5 * (taps / _DERIVATIVE_SIGMA) ** 2)
     kernel = (kernel / (kernel @ taps)).astype(np.float32)
     slope = cv2.filter2D(means, cv2.CV_32F, kernel[None], borderType=cv2.BORDER_REFLECT)
-    return slope.reshape(len(theta), _STRETCHES, len(across))
+    return np.asarray(slope, np.float32).reshape(len(theta), _STRETCHES, len(across))
 
 
 def _spans(near: NDArray[np.bool_], valid: NDArray[np.bool_]) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
@@ -174,7 +176,7 @@ def _same(a: EdgeLine, b: EdgeLine) -> bool:
 
 
 def image_noise(patch: Float32) -> float:
-    """Standard deviation of the white noise, grey values (Immerkaer 1996, by the median, so that edges count little)."""
+    """Standard deviation of the white noise, grey values (Immerkaer 1996, by the median, for the edges)."""
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     response = np.abs(cv2.filter2D(patch, cv2.CV_32F, kernel))[1:-1, 1:-1]
     response = response[np.isfinite(response)]

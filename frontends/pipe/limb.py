@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from ..covariance import larger
+
 Float = NDArray[np.float64]
 
-_STRETCH_PX = 8.0
+_STRETCH_PX = 5.0
 _ITERATIONS = 16
 _LOG_BLUR_RANGE = (float(np.log(0.4)), float(np.log(1.2)))
 """A pixel alone blurs by 0.3 px. Edges softer than 1.2 px are shading or out of focus."""
@@ -22,6 +24,8 @@ _FARTHEST_PX = 2.6
 """The fit may move the line so far: shading inside can be steeper than the edge that a seed is taken for."""
 _KINKS_PX = (0.0, 1.8, 3.2)
 """Depths at which the shading may change its slope."""
+_TERMS = 3 + len(_KINKS_PX)
+_TREND_PX = 40.0
 _WIDE, _NARROW = (4.5, 5.0), (3.0, 2.5)
 """How far outside and inside the edge a fit looks, px."""
 _SHADING_RANGE = 80.0
@@ -81,6 +85,8 @@ class _Pixels:
     """0 for padding."""
     half_width: float
     noise: float
+    evenness: float
+    """White noise over how much the pipe's own grey value varies from stretch to stretch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +149,7 @@ def fit_edge(
 
 def _converged(pixels: _Pixels) -> _State | None:
     """Levenberg-Marquardt in three stages (see `_prior`); None where the edge runs away."""
-    state = _State(0.0, 0.0, _USUAL_LOG_BLUR, np.zeros(1 + len(_KINKS_PX)))
+    state = _State(0.0, 0.0, _USUAL_LOG_BLUR, np.zeros(_TERMS))
     linear, weights, damping = _linearise(pixels, state), np.ones(len(pixels.grey)), 1e-3
     for iteration in range(_ITERATIONS):
         prior = _prior(iteration // 4)
@@ -183,7 +189,7 @@ def _gather(
     inside = float(np.clip(0.8 * half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
     along = (px - foot_px) @ np.array([-line[1], line[0]])
-    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey)
+    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey + depth)
     grey, depth, along = grey[keep], depth[keep], along[keep]
     number = max(1, round((span[1] - span[0]) / _STRETCH_PX))
     stretch = np.minimum(((along - span[0]) / (span[1] - span[0]) * number).astype(int), number - 1)
@@ -196,7 +202,23 @@ def _gather(
     table = np.zeros((4, number, count.max()))
     for i, values in enumerate((grey, depth, along, np.ones(len(grey)))):
         table[i, stretch[order], place] = values[order]
-    return _Pixels(*table[:, full], half_width_px, max(noise, 0.3))
+    table = table[:, full]
+    noise = max(noise, 0.3)
+    values, depths, places, weight = table
+    evenness = noise / _stains(values, depths, places, weight, inside)
+    return _Pixels(values, depths, places, weight, half_width_px, noise, evenness)
+
+
+def _stains(grey: Float, depth: Float, along: Float, weight: Float, inside: float) -> float:
+    """How much the pipe's grey value varies along it beyond a trend, well inside the edge; at least half a level."""
+    deep = weight * (depth > min(2.2, inside - 1.5))
+    count = deep.sum(axis=1)
+    seen = count > 3
+    if seen.sum() < 4:
+        return 20.0
+    level, place = ((deep * a).sum(axis=1)[seen] / count[seen] for a in (grey, along))
+    left = level - np.polyval(np.polyfit(place, level, 1), place)
+    return max(1.4826 * float(np.median(np.abs(left))), 0.5)
 
 
 def _linearise(pixels: _Pixels, state: _State) -> _Linear:
@@ -205,12 +227,14 @@ def _linearise(pixels: _Pixels, state: _State) -> _Linear:
     x = tau / blur
     step = ndtr(x)
     bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    shading, by_depth, by_width = _shading(tau, blur, pixels.half_width)
+    shading, by_depth, by_width = _shading(tau, pixels.along, blur, pixels.half_width)
     ramp = -tau * (1 - step) + blur * bell
     basis = np.stack((1 - step, ramp, step), axis=2) * pixels.weight[..., None]
+    # The pipe's grey value goes on along it, to within its own stains: one row more holds each stretch's deviation.
+    basis = np.concatenate((basis, np.broadcast_to([0.0, 0.0, pixels.evenness], (len(basis), 1, 3))), axis=1)
     turned = basis.transpose(0, 2, 1)
     solver = np.linalg.inv(turned @ basis + 1e-9 * np.eye(3)) @ turned
-    wanted = (pixels.grey - shading @ state.shading) * pixels.weight
+    wanted = np.pad((pixels.grey - shading @ state.shading) * pixels.weight, ((0, 0), (0, 1)))
     level = (solver @ wanted[..., None])[..., 0]
     residual = wanted - (basis @ level[..., None])[..., 0]
     jump = (level[:, 2] - level[:, 0])[:, None]
@@ -218,7 +242,7 @@ def _linearise(pixels: _Pixels, state: _State) -> _Linear:
     by_tau = jump * bell / blur - slope * (1 - step) + by_depth @ state.shading
     by_blur = -jump * bell * x + slope * bell * blur + by_width @ state.shading
     jacobian = np.concatenate((np.stack((by_tau, -by_tau * pixels.along, by_blur), axis=2), shading), axis=2)
-    jacobian = jacobian * pixels.weight[..., None]
+    jacobian = np.pad(jacobian * pixels.weight[..., None], ((0, 0), (0, 1), (0, 0)))
     jacobian = jacobian - basis @ (solver @ jacobian)
     freedom = np.maximum(pixels.weight.sum(axis=1) - 4, 1)
     squares = (residual**2).sum(axis=1)
@@ -228,7 +252,7 @@ def _linearise(pixels: _Pixels, state: _State) -> _Linear:
     return _Linear(jacobian, residual, shift, np.sqrt(variance / strength), squares, variance)
 
 
-def _shading(tau: Float, blur: float, half_width: float) -> tuple[Float, Float, Float]:
+def _shading(tau: Float, along: Float, blur: float, half_width: float) -> tuple[Float, Float, Float]:
     """What the shading inside may look like, blurred: terms, derivatives by depth and by log blur, (..., terms) each.
 
     The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
@@ -236,9 +260,16 @@ def _shading(tau: Float, blur: float, half_width: float) -> tuple[Float, Float, 
     """
     scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
     x = tau / blur
+    here = along / _TREND_PX
+    bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    inside = [(ndtr(x), bell / blur, -bell * x)]
+    inside.append(tuple(value * here for value in inside[0]))
     root = scale * np.interp(x, _LIMB_X, _LIMB_Y)
     root_slope = scale * np.interp(x, _LIMB_X, _LIMB_SLOPE) / blur
-    terms, by_depth, by_width = [root], [root_slope], [0.5 * root - root_slope * tau]
+    terms, by_depth, by_width = (list(values) for values in zip(*inside, strict=True))
+    terms.append(root)
+    by_depth.append(root_slope)
+    by_width.append(0.5 * root - root_slope * tau)
     for start in _KINKS_PX:
         y = (tau - start) / blur
         bell = np.exp(-0.5 * y**2) / np.sqrt(2 * np.pi)
@@ -269,9 +300,10 @@ def _normal(linear: _Linear, weights: Float, prior: Float) -> tuple[Float, Float
 
 def _prior(stage: int) -> Float:
     """Information of the weak priors; early stages hold blur and kinks, so that the step is found before its finish."""
-    shading = np.full(1 + len(_KINKS_PX), _SHADING_RANGE**-2.0)
+    shading = np.full(_TERMS, _SHADING_RANGE**-2.0)
+    shading[0] = 1e-6
     if stage < 2:
-        shading[1:] = 1e6
+        shading[3:] = 1e6
     return np.concatenate(((1e-9, 1e-9, 1.0 if stage >= 1 else 1e6), shading))
 
 
@@ -282,15 +314,7 @@ def _covariance(linear: _Linear, weights: Float) -> Float:
     inverse = np.linalg.inv(normal)
     effective = weights.sum() ** 2 / (weights**2).sum()
     sandwich = inverse @ (scores.T @ scores) @ inverse * effective / max(effective - 2.0, 0.5)
-    return _larger(inverse[:2, :2], sandwich[:2, :2])
-
-
-def _larger(a: Float, b: Float) -> Float:
-    """A covariance that is no smaller than either in any direction."""
-    root = np.linalg.cholesky(a)
-    inner = np.linalg.solve(root, np.linalg.solve(root, b).T)
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    return root @ (vectors * np.maximum(values, 1.0)) @ vectors.T @ root.T
+    return larger(np.asarray(inverse[:2, :2], np.float64), sandwich[:2, :2])
 
 
 def _result(line: Float, foot_px: Float, pixels: _Pixels, state: _State, spread: Float) -> EdgeFit | None:

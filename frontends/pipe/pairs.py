@@ -55,6 +55,8 @@ class EdgePair:
     """Log-likelihood by geometry and support."""
     surprise: float
     """Chi-square of middle and width (and direction) against the prior."""
+    region: float = 0.0
+    """Log-likelihood ratio that a pipe fills the space between, see `surface.region_score`."""
 
 
 def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limits: PairLimits) -> list[EdgePair]:

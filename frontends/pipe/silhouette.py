@@ -1,19 +1,19 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, OutlineSighting, Rejection
-from ..rays import ideal_from_raw, pixel_rays, raw_from_ideal
-from .edges import image_noise, straight_lines
+from ..rays import ideal_grid
+from ..undistort import distort, undistort
+from .edges import EdgeLine, image_noise, straight_lines
 from .limb import EdgeFit, fit_edge
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
-from .surface import occlusion_score
+from .surface import occlusion_score, region_edges, region_score, sampled
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -26,8 +26,8 @@ class OutlineConfig:
     reach_px: float = 80.0
     """Edges are followed so far from the centre."""
     click_sigma_px: float = 1.5
-    limits: PairLimits = PairLimits()
-    refined_pairs: int = 6
+    limits: PairLimits = field(default_factory=PairLimits)
+    refined_pairs: int = 7
     """Hypotheses that get the sub-pixel fit."""
     lowest_quality: float = 0.8
     largest_sigma_px: float = 0.5
@@ -35,11 +35,16 @@ class OutlineConfig:
     shortest_px: float = 14.0
     largest_surprise: float = 9.2
     """Chi-square (2 degrees of freedom, 99 %) of middle and width against the prior."""
+    textured: float = 5.0
+    """Log-likelihood ratio of `surface.region_score` from which the background's texture shows where the pipe ends."""
     lowest_sharpness: float = 0.55
     """See `limb.EdgeFit.sharpness`."""
 
 
 _NO_FIT = 3.0
+_NEAR_FITTED_PX, _NEAR_SEEDS_PX = 0.5, 1.6
+_REGIONS = 30
+"""Hypotheses whose inside is looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +63,11 @@ class OutlineFinder:
     def __init__(self, camera: CameraModel, config: OutlineConfig | None = None) -> None:
         self._camera = camera
         self._config = config or OutlineConfig()
-        self._ideal = pixel_rays(camera) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+        self._ideal = ideal_grid(camera)
 
     def near_pick(
-        self, stamp_ns: int, pipe_id: str, image: Grey, pick_px: Float, expected_radius_px: tuple[float, float] | None = None,
+        self, stamp_ns: int, pipe_id: str, image: Grey, pick_px: Float,
+        expected_radius_px: tuple[float, float] | None = None,
         axis_hint_px: Float | None = None,
     ) -> OutlineSighting | Rejection:  # fmt: skip
         """The outline about an operator's pick.
@@ -91,7 +97,10 @@ class OutlineFinder:
         noise = image_noise(grey)
         patch, centre = self._ideal_patch(image, prior.centre_px)
         lines = straight_lines(patch, centre, noise, self._widest(prior), self._angles(prior))
+        lines += self._textured(patch, centre, lines, prior)
         pairs = edge_pairs(lines, prior, self._camera.fx, config.limits)
+        pairs = [self._filled(pair, patch, prior.centre_px - centre, prior.centre_px) for pair in pairs[:_REGIONS]]
+        pairs.sort(key=lambda pair: -pair.score)
         if not pairs:
             return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
         found = self._refined(pairs, grey.astype(float), self._ideal[rows, columns], prior, noise)
@@ -113,8 +122,8 @@ class OutlineFinder:
         half = int(np.ceil(1.5 * self._config.reach_px))
         corner = np.floor(centre) - half
         grid = np.stack(np.meshgrid(*(np.arange(2 * half + 2, dtype=float),) * 2), axis=2) + corner
-        raw = raw_from_ideal(grid.reshape(-1, 2), self._camera).astype(np.float32).reshape(grid.shape)
-        patch = cv2.remap(image.astype(np.float32), raw, None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, np.nan)
+        raw = distort(self._camera, grid)
+        patch = sampled(image.astype(np.float32), raw)
         return patch, centre - corner
 
     def _widest(self, prior: OutlinePrior) -> float:
@@ -155,6 +164,28 @@ class OutlineFinder:
             for f in found
         ]
 
+    def _textured(
+        self, patch: NDArray[np.float32], centre: Float, lines: list[EdgeLine], prior: OutlinePrior
+    ) -> list[EdgeLine]:
+        """Edges without much contrast on the whole, but with texture on one side only."""
+        if prior.direction_rad is None:
+            angles = [line.angle for line in sorted(lines, key=lambda line: -line.evidence)[:6]]
+        else:
+            spread = np.clip(prior.direction_sigma_rad, 0.0, 0.05)
+            angles = [prior.direction_rad + np.pi / 2 + step * spread for step in (-1.0, 0.0, 1.0)]
+        found = []
+        for angle in angles:
+            for rho, evidence in region_edges(patch, centre, angle, self._widest(prior)):
+                turned = float(np.mod(angle, np.pi))
+                sign = 1.0 if np.cos(angle - turned) > 0 else -1.0
+                found.append(EdgeLine(turned, sign * rho, (-40.0, 40.0), min(evidence, 12.0)))
+        return found
+
+    @staticmethod
+    def _filled(pair: EdgePair, patch: NDArray[np.float32], origin: Float, core_px: Float) -> EdgePair:
+        region = region_score(patch, origin, pair.lines, core_px, 0.5 * pair.width_px)
+        return replace(pair, score=pair.score + region, region=region)
+
     @staticmethod
     def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
         if found.fits is None:
@@ -172,7 +203,8 @@ class OutlineFinder:
         config = self._config
         scores = np.array([f.score for f in found])
         share = np.exp(scores - scores.max())
-        quality = float(share[0] / share.sum())
+        same = np.array([_same_place(f, found[0], prior.centre_px) for f in found])
+        quality = float(share[same].sum() / share.sum())
         if quality < self._config.lowest_quality:
             return self._refuse(stamp_ns, pipe_id, "outline is ambiguous, probability of the best pair of edges",
                                 quality, self._config.lowest_quality)  # fmt: skip
@@ -182,20 +214,26 @@ class OutlineFinder:
         if best.pair.surprise > config.largest_surprise:
             return self._refuse(stamp_ns, pipe_id, "edges lie where they are not expected, chi-square of 2",
                                 best.pair.surprise, config.largest_surprise)  # fmt: skip
-        soft = min(fit.sharpness for fit in best.fits)
-        if soft < config.lowest_sharpness:
-            return self._refuse(stamp_ns, pipe_id, "edge is soft like shading, part of the change within 1 px",
-                                soft, config.lowest_sharpness)  # fmt: skip
-        sigma = max(float(np.sqrt(fit.covariance[0, 0])) for fit in best.fits)
-        if sigma > self._config.largest_sigma_px:
-            return self._refuse(stamp_ns, pipe_id, "edge is unsure, sigma in px", sigma, self._config.largest_sigma_px)
-        length = min(fit.extent[1] - fit.extent[0] for fit in best.fits)
-        if length < self._config.shortest_px:
-            return self._refuse(stamp_ns, pipe_id, "edge is short, px", length, self._config.shortest_px)
-        return self._sighting(stamp_ns, pipe_id, best, prior, quality)
+        trouble = [self._edge_trouble(fit, best.pair.region) for fit in best.fits]
+        sure = [t is None for t in trouble]
+        # With the width known one sure edge is a measurement; with nothing known both have to be found.
+        if not any(sure) or (prior.half_width_px is None and not all(sure)):
+            return self._refuse(stamp_ns, pipe_id, *next(t for t in trouble if t is not None))
+        return self._sighting(stamp_ns, pipe_id, best, prior, quality, sure)
+
+    def _edge_trouble(self, fit: EdgeFit, region: float) -> tuple[str, float, float] | None:
+        """Why an edge is no measurement: what, how much, limit."""
+        config = self._config
+        if fit.sharpness < config.lowest_sharpness and region < config.textured:
+            return "edge is soft like shading, part of the change within 1 px", fit.sharpness, config.lowest_sharpness
+        sigma = float(np.sqrt(fit.covariance[0, 0]))
+        if sigma > config.largest_sigma_px:
+            return "edge is unsure, sigma in px", sigma, config.largest_sigma_px
+        length = fit.extent[1] - fit.extent[0]
+        return ("edge is short, px", length, config.shortest_px) if length < config.shortest_px else None
 
     def _sighting(
-        self, stamp_ns: int, pipe_id: str, best: _Found, prior: OutlinePrior, quality: float
+        self, stamp_ns: int, pipe_id: str, best: _Found, prior: OutlinePrior, quality: float, sure: list[bool]
     ) -> OutlineSighting:
         assert best.fits is not None
         lines = np.array([fit.line for fit in best.fits])
@@ -204,7 +242,10 @@ class OutlineFinder:
         extent = np.array(
             [[foot + s * t for s in fit.extent] for foot, t, fit in zip(feet, along, best.fits, strict=True)]
         )
-        covariance = np.array([fit.covariance for fit in best.fits])
+        # An edge that is not sure lies somewhere between the pipe's middle and as far outside.
+        anywhere = np.diag([(0.5 * best.pair.width_px) ** 2, 0.1])
+        known = zip(best.fits, sure, strict=True)
+        covariance = np.array([fit.covariance if good else anywhere for fit, good in known])
         return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
 
     @property
@@ -222,6 +263,16 @@ def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
         nested = any(outer is not inner and outer.fits is not None and _contains(outer, inner) for outer in found)
         result.append(replace(inner, score=inner.score - penalty * nested))
     return sorted(result, key=lambda f: -f.score)
+
+
+def _same_place(one: _Found, other: _Found, centre_px: Float) -> bool:
+    """True when two hypotheses mean the same two edges (seeds differ; what they were fitted to does not)."""
+    nearest = _NEAR_FITTED_PX if one.fits is not None and other.fits is not None else _NEAR_SEEDS_PX
+    lines = [np.array([f.line for f in h.fits]) if h.fits is not None else h.pair.lines for h in (one, other)]
+    first, second = (line @ np.append(centre_px, 1.0) for line in lines)
+    if lines[0][0, :2] @ lines[1][0, :2] < 0:
+        second = second[::-1]
+    return bool(np.abs(first - second).max() < nearest)
 
 
 def _contains(outer: _Found, inner: _Found) -> bool:
@@ -257,5 +308,5 @@ def silhouette_sighting(
     pipe_id: str = "pipe0",
 ) -> OutlineSighting | Rejection:
     """The outline about one pick in one image; see `OutlineFinder.near_pick`. With `raw` the pick is a raw pixel."""
-    pick = ideal_from_raw(pick_px[None], camera)[0] if raw else pick_px
+    pick = undistort(camera, pick_px)[0] if raw else pick_px
     return OutlineFinder(camera).near_pick(stamp_ns, pipe_id, image, pick, expected_radius_px, axis_hint_px)

@@ -9,6 +9,9 @@ Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 _BIN_PX = 2
+_REGION_PX = 30
+_INDEPENDENT = 6.0
+"""Independent bits of texture along a strip of 60 px: bricks and stains are that large."""
 
 
 def occlusion_score(
@@ -44,6 +47,13 @@ def occlusion_score(
     return max(score, -8.0)
 
 
+def sampled(patch: Float32, px: Float) -> Float32:
+    """Grey values at places (..., 2) of a patch, interpolated; NaN outside."""
+    u, v = (np.ascontiguousarray(px[..., i].reshape(len(px), -1), dtype=np.float32) for i in (0, 1))
+    values = cv2.remap(patch, u, v, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, (np.nan,) * 4)
+    return np.asarray(values, np.float32).reshape(px.shape[:-1])
+
+
 def _profile(
     patch: Float32, origin: Float, line: Float, span: tuple[float, float], foot: Float, start: float, end: float
 ) -> Float:
@@ -54,7 +64,7 @@ def _profile(
     along = span[0] + 0.5 + np.arange(bins * _BIN_PX)
     across = np.linspace(start, end, max(2, round(end - start) + 1))
     place = foot - origin + along[:, None, None] * np.array([-line[1], line[0]]) + across[:, None] * line[:2]
-    values = cv2.remap(patch, place.astype(np.float32), None, cv2.INTER_LINEAR, None, cv2.BORDER_CONSTANT, np.nan)
+    values = sampled(patch, place)
     return values.reshape(bins, -1).mean(axis=1).astype(float)
 
 
@@ -62,3 +72,89 @@ def _flat(values: Float) -> Float:
     """Without mean and trend."""
     place = np.arange(len(values)) - 0.5 * (len(values) - 1)
     return values - values.mean() - place * float(values @ place) / float(place @ place)
+
+
+def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, half_width_px: float) -> float:
+    """Log-likelihood ratio that a pipe fills the space between two edges, by the texture along it.
+
+    A pipe's grey value goes on along its axis, that of a wall behind mostly does not. Strips of the image along the
+    axis are told apart by their variance; where pipe and background are alike in it, the score is 0.
+
+    Args:
+        patch: Shape (h, w), ideal pixels, NaN outside the image.
+        origin: Shape (2,), the patch's first pixel in ideal pixels.
+        lines: Shape (2, 3), the edges, positive outside.
+        core_px: Shape (2,), a point on the pipe.
+        half_width_px: Half its width.
+    """
+    across = lines[0, :2] - lines[1, :2]
+    across = across / np.linalg.norm(across)
+    axis = np.array([-across[1], across[0]])
+    reach = int(half_width_px * 1.3) + 10
+    place = np.arange(-reach, reach + 1.0)
+    along = np.arange(-_REGION_PX, _REGION_PX + 1.0)
+    grid = core_px - origin + place[:, None, None] * across + along[:, None] * axis
+    strips = sampled(patch, grid)
+    strips = strips[np.isfinite(strips).mean(axis=1) > 0.99]
+    if len(strips) < len(place):
+        return 0.0
+    smooth = (
+        strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
+    )
+    variance = np.array([_flat(strip).var() for strip in smooth]) + 0.5
+    inside = _signed(lines, core_px, place, across)
+    pipe = float(np.median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)]))
+    wall = float(np.median(variance[inside < -2.0])) if (inside < -2.0).any() else pipe
+    if wall < 2.0 * pipe:
+        return 0.0
+    likeness = 0.5 * _INDEPENDENT * (np.log(wall / pipe) - variance * (1 / pipe - 1 / wall))
+    likeness = np.clip(likeness, -3.0, 3.0)
+    # Strips next to an edge hold both sides; beyond 6 px another thing may begin.
+    score = likeness[inside > 1.0].sum() - likeness[(inside < -1.0) & (inside > -6.0)].sum()
+    return float(np.clip(0.4 * score, -15.0, 15.0))
+
+
+def _signed(lines: Float, core_px: Float, place: Float, across: Float) -> Float:
+    """Distance inside the nearer edge for places across the pipe, negative outside."""
+    px = np.column_stack((core_px + place[:, None] * across, np.ones(len(place))))
+    return -(px @ lines.T).max(axis=1)
+
+
+def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) -> list[tuple[float, float]]:
+    """Where the texture along a direction begins on either side of a place: (distance, log-likelihood ratio) each.
+
+    Args:
+        patch: Shape (h, w), ideal pixels, NaN outside the image.
+        centre: Shape (2,), a point on the pipe, in pixels of the patch.
+        angle: Direction across the pipe, rad.
+        widest_px: How far to look.
+    """
+    across = np.array([np.cos(angle), np.sin(angle)])
+    axis = np.array([-across[1], across[0]])
+    reach = int(widest_px) + 12
+    place = np.arange(-reach, reach + 1.0)
+    along = np.arange(-_REGION_PX, _REGION_PX + 1.0)
+    strips = sampled(patch, centre + place[:, None, None] * across + along[:, None] * axis)
+    smooth = strips[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2).astype(float)
+    known = np.isfinite(smooth).all(axis=1)
+    variance = (
+        np.array([_flat(strip).var() if good else np.nan for strip, good in zip(smooth, known, strict=True)]) + 0.5
+    )
+    core = variance[(np.abs(place) <= 3.0) & known]
+    if len(core) < 4:
+        return []
+    pipe, found = float(np.median(core)), []
+    for side in (-1.0, 1.0):
+        order = np.nonzero(place == 0)[0][0] + (side * np.arange(1, reach + 1)).astype(int)
+        order = order[known[order]]
+        if len(order) < 12:
+            continue
+        wall = float(np.median(variance[order[-10:]]))
+        if wall < 2.0 * pipe:
+            continue
+        likeness = 0.5 * _INDEPENDENT * (np.log(wall / pipe) - variance[order] * (1 / pipe - 1 / wall))
+        total = np.cumsum(np.clip(likeness, -3.0, 3.0))
+        last = int(np.argmax(total))
+        if 1 < last < len(order) - 3:
+            found.append((side * (last + 1.5), 0.4 * float(total[last] - total[-1])))
+    return found

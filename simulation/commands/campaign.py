@@ -13,6 +13,7 @@ from rich.table import Table
 from ...estimator.executor import choose_executor
 from ...factors.errors import SurecutError
 from ..campaign import open_campaign, run_campaign, write_whole
+from ..campaign_real import real_table, real_text
 from ..campaign_report import label, quantity_text, report_html
 from ..campaign_table import CampaignTable, tabulate, write_tables
 from ..campaign_validation import update_validation
@@ -33,10 +34,14 @@ def command(
     leave_out: Annotated[
         bool, typer.Option("--leave-out", help="Estimate again without each family of measurements.")
     ] = False,
+    real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
 ) -> None:
     """Runs a campaign and writes summary.json, summary.csv, quantities.csv and report.html."""
     console = Console()
+    if real is not None:
+        _real(console, real, output, validation)
+        return
     campaign = open_campaign(scenario, level, leave_out)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
@@ -95,3 +100,15 @@ def _print(console: Console, table: CampaignTable) -> None:
         f"{table.runs} runs, {table.failed} without a result; consistency check passed in "
         f"{100 * table.consistent:.1f} %; {table.mean_seconds:.2f} s per estimate"
     )
+
+
+def _real(console: Console, folder: Path, output: Path, validation: Path | None) -> None:
+    rows = real_table(folder)
+    if not rows:
+        raise SurecutError(f"{folder}: holds none of the recordings that are known; see its README")
+    output.mkdir(parents=True, exist_ok=True)
+    text = real_text(rows)
+    write_whole(output / "real.md", text)
+    console.print(text, markup=False)
+    if validation is not None:
+        update_validation(validation, "real recordings", "with references", text, stamp())

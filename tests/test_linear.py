@@ -1,0 +1,84 @@
+"""The two-step solution of the normal equations is the dense one."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from surecut.estimator.linear import LinearSystem
+from surecut.factors import keys
+from surecut.factors.errors import ObservabilityError
+
+
+def problem(landmarks: int, keyframes: int, chain: bool):
+    """Keyframes that see landmarks or marker corners, with priors here and there."""
+    rng = np.random.default_rng([landmarks, keyframes, chain])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    K = gtsam.Cal3_S2(300, 300, 0, 180, 120)
+    pixel = gtsam.noiseModel.Isotropic.Sigma(2, 0.5)
+    points = [keys.landmark(3 * i) for i in range(landmarks)] + [keys.corner(0, i) for i in range(4)]
+    for i, key in enumerate(points):
+        point = np.array([*rng.uniform(-0.5, 0.5, 2), 2.0 + rng.random()])
+        values.insert(key, point)
+        if keys.kind(key) == "q" or i % 3 == 0:
+            graph.add(gtsam.PriorFactorPoint3(key, point + 0.01, gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+    for k in range(keyframes):
+        pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0, 0.05, 3)), rng.normal(0, 0.2, 3))
+        values.insert(keys.keyframe(k), pose)
+        for key in points:
+            px = gtsam.PinholeCameraCal3_S2(pose, K).project(values.atPoint3(key)) + rng.normal(0, 0.5, 2)
+            graph.add(gtsam.GenericProjectionFactorCal3_S2(px, pixel, keys.keyframe(k), key, K))
+        if chain and k:
+            earlier = values.atPose3(keys.keyframe(k - 1))
+            noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+            graph.add(
+                gtsam.BetweenFactorPose3(keys.keyframe(k - 1), keys.keyframe(k), earlier.between(pose), noise)
+            )
+    return graph, values
+
+
+@pytest.mark.parametrize(("landmarks", "keyframes", "chain"), [(0, 5, False), (0, 5, True), (12, 4, False), (12, 4, True)])
+def test_covariances_are_those_of_the_dense_inverse(landmarks, keyframes, chain):
+    graph, values = problem(landmarks, keyframes, chain)
+    system = LinearSystem(graph, values)
+    covariance = np.linalg.inv((system.A.T @ system.A).toarray())
+    np.testing.assert_allclose(system.solve(np.eye(system.parameters)), covariance, rtol=1e-6, atol=1e-10)
+    every = list(system.columns)
+    for key, found in zip(every, system.marginals(every), strict=True):
+        np.testing.assert_allclose(found, covariance[system.columns[key], system.columns[key]], rtol=1e-6, atol=1e-10)
+    wanted = gtsam.Marginals(graph, values).marginalCovariance(keys.keyframe(1))
+    np.testing.assert_allclose(system.joint([keys.keyframe(1)]), wanted, rtol=1e-6, atol=1e-10)
+
+
+def test_marginals_under_larger_errors_are_blocks_of_the_sandwich():
+    system = LinearSystem(*problem(12, 4, True))
+    system.inflation = np.random.default_rng(0).uniform(1, 3, len(system.b))
+    for key in system.columns:
+        np.testing.assert_allclose(system.marginals([key])[0], system.joint([key]), rtol=1e-6, atol=1e-10)
+
+
+def test_hat_matrix_and_standardised_residuals():
+    graph, values = problem(12, 4, True)
+    system = LinearSystem(graph, values)
+    A = system.A.toarray()
+    hat = A @ np.linalg.solve(A.T @ A, A.T)
+    positions = list(range(0, graph.size(), 5))
+    for position, block in zip(positions, system.hats(positions), strict=True):
+        rows = slice(system.starts[position], system.starts[position + 1])
+        np.testing.assert_allclose(block, hat[rows, rows], atol=1e-9)
+    total, dof = system.standardised([positions[1]])[0]
+    rows = slice(system.starts[positions[1]], system.starts[positions[1] + 1])
+    spread = np.eye(dof) - hat[rows, rows]
+    assert dof == rows.stop - rows.start
+    assert total == pytest.approx(system.b[rows] @ np.linalg.solve(spread, system.b[rows]), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [(keys.landmark(99), np.array([0.0, 0, 1]), "landmark 99"), (keys.point(2), np.array([0.0, 0, 1]), "pipe point 2")],
+)
+def test_what_nothing_determines_is_named(key, value, words):
+    graph, values = problem(3, 3, False)
+    values.insert(key, value)
+    graph.add(gtsam.RangeFactor3(key, keys.corner(0, 0), 1.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.1)))
+    with pytest.raises(ObservabilityError, match=f"{words} is not observable"):
+        LinearSystem(graph, values)
