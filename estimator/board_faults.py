@@ -1,7 +1,7 @@
 """After the run: what of the boards contradicts the rig, by the final estimate; it is released and solved again."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -20,6 +20,7 @@ from .engine import Engine
 from .graph import Record, Update
 from .linear import LinearSystem, deviate
 from .odometry import FAMILY as ODOMETRY
+from .result import CalibrationEstimate
 from .sheet import Knock, Sheet
 
 Float = NDArray[np.float64]
@@ -53,6 +54,10 @@ class Fault:
     shift_m: float = 0.0
     shift_sigma_m: float = 0.0
 
+    @property
+    def name(self) -> tuple[str, str, int]:
+        return self.kind, self.sheet.board.id, self.marker
+
 
 @dataclass(frozen=True, slots=True)
 class _Look:
@@ -71,15 +76,6 @@ class _Look:
         rows = ((p, i, r) for p, (i, _, r) in enumerate(self.active) if r.what == what)
         return next(rows, None)
 
-    def rows(self, position: int) -> slice:
-        return slice(int(self.system.starts[position]), int(self.system.starts[position + 1]))
-
-    def column(self, position: int, block: Float) -> csr_matrix:
-        """Directions (rows of one factor, k) as columns over all rows."""
-        start, (m, k) = int(self.system.starts[position]), block.shape
-        i, j = np.meshgrid(np.arange(start, start + m), np.arange(k), indexing="ij")
-        return csr_matrix((block.ravel(), (i.ravel(), j.ravel())), shape=(self.system.A.shape[0], k))
-
 
 def settle_boards(engine: Engine, solution: BatchSolution) -> BatchSolution:
     """Releases what is wrong, the worst first, until the rest agrees; the boards' events then say the final figures.
@@ -87,11 +83,14 @@ def settle_boards(engine: Engine, solution: BatchSolution) -> BatchSolution:
     A wrong statement pulls others with it, so that only the worst one is taken at a time (Baarda 1968).
     """
     solution = _correct_insets(engine, solution)
+    done: set[tuple[str, str, int]] = set()
     for _ in range(ROUNDS):
-        found = _faults(_look(engine, solution))
+        found = [f for f in _faults(_look(engine, solution)) if f.name not in done]
         if not found:
             break
-        solution = _again(engine, solution, *_released(engine, max(found, key=lambda f: f.excess), solution))
+        worst = max(found, key=lambda f: f.excess)
+        done.add(worst.name)
+        solution = _again(engine, solution, *_released(engine, worst, solution))
     _tell(_look(engine, solution))
     return solution
 
@@ -101,7 +100,23 @@ def _look(engine: Engine, solution: BatchSolution) -> _Look:
     active = [row for row in engine.solver.log.active() if row[0] not in off]
     system = inflated_system(active, solution.values, ODOMETRY)
     names, sigmas, C = inset_directions(engine.solver.log, active, system, solution.values, engine.boards)
-    return _Look(engine, solution.values, active, system, Insets(names, sigmas, system.shift(C)), C)
+    sides = [side_words(sheet.board.id) for sheet in engine.boards.sheets.values()]
+    priors = [p for p, (_, _, r) in enumerate(active) if r.what in sides]
+    columns = [_column(system, p, -_noise(active[p][1]).whiten(np.ones(1))[:, None]) for p in priors]
+    shift = system.shift(csr_matrix(hstack([C, *columns])))
+    return _Look(engine, solution.values, active, system, Insets(names, sigmas, shift), C)
+
+
+def _noise(factor: gtsam.NonlinearFactor) -> Any:
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    return factor.noiseModel()
+
+
+def _column(system: LinearSystem, position: int, block: Float) -> csr_matrix:
+    """Directions (rows of one factor, k) as columns over all rows."""
+    start, m, k = int(system.starts[position]), *block.shape
+    i, j = np.meshgrid(np.arange(start, start + m), np.arange(k), indexing="ij")
+    return csr_matrix((block.ravel(), (i.ravel(), j.ravel())), shape=(len(system.b), k))
 
 
 def _again(engine: Engine, solution: BatchSolution, update: Update, remove: list[int]) -> BatchSolution:
@@ -119,22 +134,26 @@ def _correct_insets(engine: Engine, solution: BatchSolution) -> BatchSolution:
     look = _look(engine, solution)
     if not look.insets.names:
         return solution
-    value, covariance = look.insets.solution()
-    sigma = np.sqrt(np.diag(covariance))
-    told = (np.abs(value) > GATE_SIGMA * sigma) & ~look.insets.frozen()
+    value, sigma = look.insets.by_size_alone()
+    frozen = look.insets.frozen()
+    told = (np.abs(value) > GATE_SIGMA * sigma) & ~frozen
     for i, (camera, board) in enumerate(look.insets.names):
-        engine.boards.insets_px[camera, board] = (float(value[i]) if told[i] else 0.0, float(sigma[i]), bool(told[i]))
+        prior = float(look.insets.prior_sigma_px[i])
+        row = CalibrationEstimate(
+            f"{board}.{camera}.corner_inset", "px", float(value[i]), float(sigma[i]), 0.0, prior, bool(frozen[i])
+        )
+        engine.boards.insets.append(row)
         if told[i]:
             text = (
-                f"board {board}: its corners in {camera} lie {value[i]:.2f} +/- {sigma[i]:.2f} px inside the true ones; "
-                "moved outwards"
+                f"board {board}: its corners in {camera} lie {value[i]:.2f} +/- {sigma[i]:.2f} px inside the true "
+                "ones; moved outwards"
             )
             values = {"inset_px": float(value[i]), "sigma_px": float(sigma[i])}
             engine.boards.say(engine.end_ns, "corner_inset", f"{board} {camera}", text, "info", **values)
     if not told.any():
         return solution
     moved = {name: float(value[i]) for i, name in enumerate(look.insets.names) if told[i]}
-    return _again(engine, solution, *corrected_corners(engine.solver.log, moved))
+    return _again(engine, solution, *corrected_corners(engine.solver.log, solution.values, moved))
 
 
 # What contradicts ---------------------------------------------------------------------------------------------
@@ -159,10 +178,10 @@ def _side_fault(look: _Look, sheet: Sheet) -> Fault | None:
     position, index, record = place
     if look.engine.boards.told("side_length_wrong", sheet.board.id):
         off, sigma = _side_off(look, sheet)
-        inside = abs(off) / float(np.hypot(sigma, sheet.board.side_sigma_m)) < GATE_SIGMA - 1.0
+        inside = abs(off) / float(np.hypot(sigma, sheet.board.side_sigma_m)) < GATE_SIGMA
         return Fault("side_restored", 1e9, sheet, index, record) if inside else None
-    W = look.active[position][1].noiseModel().whiten(np.ones(1))
-    C = hstack([look.column(position, -W[:, None]), look.C]).tocsr()
+    W = _noise(look.active[position][1]).whiten(np.ones(1))
+    C = csr_matrix(hstack([_column(look.system, position, -W[:, None]), look.C]))
     shift = look.system.shift(C)
     information = shift.information.copy()
     information[1:, 1:] += np.diag(look.insets.prior_sigma_px**-2)
@@ -178,15 +197,16 @@ def _side_off(look: _Look, sheet: Sheet) -> tuple[float, float]:
     side, scale = look.values.atVector(sheet.page)
     J = np.array([[1.0, -sheet.board.side_m]])
     inset, spread = look.insets.solution()
-    through = J @ look.insets.shift.response[look.system.columns[sheet.page]]
+    through = J @ look.insets.shift.response[look.system.columns[sheet.page], : len(look.insets.names)]
     variance = look.system.covariance([(sheet.page, J)]) + through @ spread @ through.T
     return float(side - scale * sheet.board.side_m + (through @ inset)[0]), float(np.sqrt(variance[0, 0]))
 
 
 def _scale_fault(look: _Look, sheet: Sheet) -> Fault | None:
-    """The page's given size against everything else."""
+    """The page's given size against everything else. A single marker has a side length, and no size beside it."""
     place = look.find(scale_words(sheet.board.id))
-    if place is None or look.engine.boards.told("print_scale_wrong", sheet.board.id):
+    alone = len({page.marker for page in sheet.pages.values()}) < 2
+    if place is None or alone or look.engine.boards.told("print_scale_wrong", sheet.board.id):
         return None
     off = deviate(*look.system.standardised([place[0]])[0])
     return Fault("scale", off / GATE_SIGMA, sheet, place[1], place[2])
@@ -200,10 +220,10 @@ def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
     if place is None or page.marker in sheet.loose or alone:
         return None
     position, index, record = place
-    noise = look.active[position][1].noiseModel()
+    noise = _noise(look.active[position][1])
     directions = shift_directions(sheet.marker(page.marker), board.side_m)
     block = -np.column_stack([noise.whiten(d) for d in directions.T])
-    shift = look.system.shift(look.column(position, block))
+    shift = look.system.shift(_column(look.system, position, block))
     if not shift.determined():
         return None
     value, covariance = shift.solution()
@@ -290,8 +310,8 @@ def _rejoin(engine: Engine, sheet: Sheet, fault: Fault, update: Update) -> None:
 def _tell_loose(engine: Engine, fault: Fault) -> None:
     board, limit = fault.sheet.board, float(norm.isf(MARKER_FALSE_ALARM / 2))
     text = (
-        f"board {board.id}: marker {fault.marker} is {1e3 * fault.shift_m:.1f} +/- {1e3 * fault.shift_sigma_m:.1f} mm off "
-        "its place; its place on the page is not used"
+        f"board {board.id}: marker {fault.marker} is {1e3 * fault.shift_m:.1f} +/- {1e3 * fault.shift_sigma_m:.1f} mm "
+        "off its place; its place on the page is not used"
     )
     stamp_ns = fault.record.stamp_ns
     values = {"marker": float(fault.marker), "shift_m": fault.shift_m, "sigma_m": fault.shift_sigma_m}
@@ -323,7 +343,7 @@ def _sigma(look: _Look, sheet: Sheet, index: int) -> float:
     J = np.zeros((1, 2))
     J[0, index] = 1.0
     _, spread = look.insets.solution()
-    through = J @ look.insets.shift.response[look.system.columns[sheet.page]]
+    through = J @ look.insets.shift.response[look.system.columns[sheet.page], : len(look.insets.names)]
     variance = look.system.covariance([(sheet.page, J)]) + through @ spread @ through.T
     return float(np.sqrt(variance[0, 0]))
 
@@ -331,8 +351,8 @@ def _sigma(look: _Look, sheet: Sheet, index: int) -> float:
 def _tell_scale(look: _Look, sheet: Sheet, event: Event) -> None:
     scale, sigma = float(look.values.atVector(sheet.page)[1]), _sigma(look, sheet, 1)
     text = (
-        f"board {sheet.board.id}: the page is printed at {100 * scale:.1f} +/- {100 * sigma:.1f} % of the size that the rig "
-        "gives; used the log's"
+        f"board {sheet.board.id}: the page is printed at {100 * scale:.1f} +/- {100 * sigma:.1f} % of the size that "
+        "the rig gives; used the log's"
     )
     values = {"scale": scale, "sigma": sigma}
     look.engine.boards.say(event.stamp_ns, "print_scale_wrong", sheet.board.id, text, "warning", **values)

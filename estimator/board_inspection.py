@@ -29,6 +29,7 @@ VIEWS_TO_EXCHANGE = 2
 """Images of different moments that have to agree that two ids are exchanged: a whole-board fit decides each."""
 VIEWS_TO_RELEASE = 3
 """Images of different moments in a row that have to agree that a marker is off its place."""
+DOUBLED = "stands in the image more than once"
 MEMORY = 25
 """Fits of accepted images by which a new one is judged: lens and print are never as perfect as the corners."""
 
@@ -102,7 +103,7 @@ class Inspection:
         for marker in double:
             self.doubled(sheet.board.id, marker, seen[0].stamp_ns)
         refuse = [k not in keep for k in range(len(seen))]
-        return self._without(seen, refuse, sheet, "stands in the image more than once, places")
+        return self._without(seen, refuse, sheet, f"{DOUBLED}, places")
 
     def _expected(self, sheet: Sheet, rest: list[MarkerSighting], markers: list[int]) -> dict[int, Float]:
         """Where markers ought to be in an image, by the rest of their board; nothing where that is in doubt."""
@@ -119,6 +120,14 @@ class Inspection:
             image = c_p @ camera.K.T
             places[marker] = image[:, :2] / image[:, 2:]
         return places
+
+    def doubled_in_images(self, refused: Sequence[Rejection]) -> None:
+        """Ids that a front end has refused already, because they stood twice in an image."""
+        for r in refused:
+            words = r.what.split()
+            if r.reason.startswith(DOUBLED) and "marker" in words:
+                at = words.index("marker")
+                self.doubled(words[at - 1], int(words[at + 1]), r.stamp_ns)
 
     def doubled(self, board: str, marker: int, stamp_ns: int) -> None:
         """Says, once, that an id is there twice."""
@@ -213,7 +222,8 @@ class Inspection:
         since = "it came loose" if marker in sheet.slots else "from the start"
         what = f"marker {marker} is {1e3 * length:.1f} +/- {1e3 * sigma:.1f} mm off its place, {since}"
         if found.kind == "inconsistent":
-            what = f"marker {marker} and the other one contradict each other by {1e3 * length:.1f} +/- {1e3 * sigma:.1f} mm"
+            off = f"{1e3 * length:.1f} +/- {1e3 * sigma:.1f} mm"
+            what = f"marker {marker} and the other one contradict each other by {off}"
         sheet.loose.add(marker)
         values = {"shift_m": length, "sigma_m": sigma}
         text = f"board {board.id}: {what}; left out"

@@ -13,7 +13,7 @@ from ..factors.board import page_corners
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.measurements import MarkerSighting
-from ..factors.rig import Rig
+from ..factors.rig import Noise, Rig
 from ..frontends.board_pose import PoseCandidate, apparent_side, board_pose_candidates
 from .graph import State
 from .sheet import Sheet
@@ -22,6 +22,12 @@ Float = NDArray[np.float64]
 
 SINGLE_VIEWS = 10
 """A page of several markers that never shows two of them at once starts from one after so many views."""
+MESSAGE_INSET_SIGMA_PX = 0.5
+"""Corners of an unknown detector: OpenCV's common settings put them 0.2 to 0.8 px inside the marker."""
+LEAST_INSET_SIGMA_PX = 0.004
+"""What the own corner fit leaves on images without noise."""
+ROUGH_TILT_RAD = 0.05
+"""A tilt known worse than this is no start where its sign is in doubt."""
 WRONG_BRANCH = 18.4
 """Chi-square by which the worse of two poses has to lose before it is ruled out: one in ten thousand."""
 
@@ -69,11 +75,13 @@ class FirstPose:
         return CameraModel(camera, 0, 0, K, "none", np.zeros(0), np.eye(3), None)
 
     def margin(self, sheet: Sheet, seen: Sequence[MarkerSighting]) -> float:
-        """Chi-square by which one image rules out the second pose of a board; infinite where it does, -1 without any."""
+        """Chi-square by which an image rules out the second pose of a board; infinite where it does, -1 without any."""
         found = self._candidates(sheet, seen, self.side(sheet, seen))
         if not found:
             return -1.0
-        return found[1].chi2 - found[0].chi2 if len(found) > 1 else float("inf")
+        if len(found) > 1:
+            return found[1].chi2 - found[0].chi2
+        return 0.0 if _frontal(found[0]) else float("inf")
 
     def side(self, sheet: Sheet, seen: Sequence[MarkerSighting]) -> Side:
         """The side length that views of one moment show: by the places of several markers, else by stereo."""
@@ -83,7 +91,11 @@ class FirstPose:
             length, sigma = apparent_side(mine, board, self.pinhole(mine[0].camera), self._rig.noise.marker_common_px)
             spread = np.array([sheet.marker(s.marker).centre_m for s in mine])
             radius = float(np.sqrt(((spread - spread.mean(0)) ** 2).sum()))
-            return Side(length, float(np.hypot(sigma, length * board.centre_sigma_m * np.sqrt(2) / radius)))
+            middles = np.array([s.corners_px.mean(0) for s in mine])
+            half_px = np.linalg.norm(np.array([s.corners_px for s in mine]) - middles[:, None], axis=2).mean()
+            inset = inset_sigma_px(mine[0], self._rig.noise) / half_px
+            place = board.centre_sigma_m * np.sqrt(2) / radius
+            return Side(length, float(np.linalg.norm([sigma, length * place, length * inset])))
         return self._stereo_side(seen) or Side(board.side_m, None)
 
     def _stereo_side(self, seen: Sequence[MarkerSighting]) -> Side | None:
@@ -131,7 +143,8 @@ class FirstPose:
         if not starts:
             return None
         if len(starts) == 1:
-            return Start(starts[0], side, True)
+            sure = not _frontal(found[0])
+            return Start(starts[0], side, sure) if sure or force else None
         views = [v for key, held in sheet.held for v in self._views(sheet, key, held, side.length_m)]
         fits = sorted((_refined(start, views) for start in starts), key=lambda fit: fit[0])
         scale = max(1.0, fits[0][0] / max(sum(2 * len(v.px) for v in views) - 6, 1))
@@ -153,10 +166,18 @@ class FirstPose:
                     o_T_c,
                     np.concatenate([page_corners(sheet.marker(s.marker), side_m) for s in mine]),
                     np.concatenate([s.corners_px for s in mine]),
-                    np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1),
+                    np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1), float),
                 )
             )
         return views
+
+
+def _frontal(pose: PoseCandidate) -> bool:
+    """The two poses of a plane have run together: its tilt is hardly known, and its sign not at all."""
+    normal, place = pose.camera_T_f[:3, 2], pose.camera_T_f[:3, 3]
+    tilt = float(np.arccos(np.clip(-(normal @ place) / np.linalg.norm(place), -1.0, 1.0)))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1]))
+    return sigma > ROUGH_TILT_RAD and (2 * tilt / sigma) ** 2 < WRONG_BRANCH
 
 
 def _refined(start: gtsam.Pose3, views: list[_View]) -> tuple[float, gtsam.Pose3]:
@@ -192,6 +213,16 @@ def _sigma_px(pair: tuple[MarkerSighting, MarkerSighting]) -> float:
     """Of the disparity of a marker's mean corner."""
     variance = sum(float(np.trace(s.covariance_px2.mean(0))) / 2 for s in pair)
     return float(np.sqrt(variance / 4))
+
+
+def inset_sigma_px(sighting: MarkerSighting, noise: Noise) -> float:
+    """How far the corners of a detector may all lie inside the true ones.
+
+    Corners that came as messages have the covariance that the rig file gives to those; what found them is not known.
+    """
+    stated = noise.marker_message_sigma_px**2 * np.eye(2)
+    told = np.allclose(sighting.covariance_px2, stated, rtol=1e-6, atol=0.0)
+    return MESSAGE_INSET_SIGMA_PX if told else max(noise.marker_common_px, LEAST_INSET_SIGMA_PX)
 
 
 def relabelled(sighting: MarkerSighting, marker: int) -> MarkerSighting:

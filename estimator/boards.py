@@ -14,8 +14,9 @@ from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Rig
 from .board_inspection import FAMILY, Inspection
 from .board_moves import Joint, displacement, may_be_the_board, new_place, still_moving
-from .board_start import FirstPose, Side
+from .board_start import FirstPose, Side, inset_sigma_px
 from .graph import Record, State, Update
+from .result import CalibrationEstimate
 from .sheet import Displaced, Knock, PageFactor, Sheet
 from .view_cells import ViewCells
 
@@ -33,9 +34,6 @@ HELD_VIEWS = 40
 STILL_VIEWS = 40
 """Views of a board from one place after which further ones are left out: they would count one part in so many."""
 
-MESSAGE_INSET_SIGMA_PX = 0.5
-"""Corners of an unknown detector: OpenCV's common settings put them 0.2 to 0.8 px inside the marker."""
-
 
 class Boards:
     """All boards of the rig."""
@@ -51,8 +49,8 @@ class Boards:
         self.inspection = Inspection(rig, state, self._first.pinhole)
         self._told: dict[tuple[str, str], Event] = {}
         self._refused: list[Rejection] = []
-        self.insets_px: dict[tuple[str, str], tuple[float, float, bool]] = {}
-        """By camera and board, after the run: the detector's inset, its sigma, and whether it was corrected."""
+        self.insets: list[CalibrationEstimate] = []
+        """After the run: how far the corners lie inside the true ones, by camera and board."""
         self.inset_sigma_px: dict[tuple[str, str], float] = {}
         """By camera and board: how far its corners may all lie inside (or outside) of the true ones."""
 
@@ -298,10 +296,8 @@ class Boards:
 
     def _note_source(self, sighting: MarkerSighting) -> None:
         """How far the detector of these corners may be biased."""
-        stated = self._rig.noise.marker_message_sigma_px
-        told = np.allclose(sighting.covariance_px2, stated**2 * np.eye(2), rtol=1e-6, atol=0.0)
-        sigma = MESSAGE_INSET_SIGMA_PX if told else self._rig.noise.marker_common_px
         key = (sighting.camera, sighting.board)
+        sigma = inset_sigma_px(sighting, self._rig.noise)
         self.inset_sigma_px[key] = max(sigma, self.inset_sigma_px.get(key, 0.0))
 
     def _predicted(self, sheet: Sheet, marker: int) -> Float:

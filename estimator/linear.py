@@ -48,7 +48,7 @@ class Shift:
     def solution(self) -> tuple[Float, Float]:
         """Estimate (k,) and covariance (k, k)."""
         covariance = np.linalg.inv(self.information)
-        return covariance @ self.right, covariance
+        return np.asarray(covariance @ self.right, float), np.asarray(covariance, float)
 
 
 class LinearSystem:

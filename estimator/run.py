@@ -39,6 +39,7 @@ def finish(
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
     solution = settle_boards(engine, solution)
+    engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events
     return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))

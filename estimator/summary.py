@@ -205,6 +205,7 @@ class Summary:
                         f"{board.id}.print_scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
                     )
                 )
+        rows += engine.boards.insets
         return tuple(rows)
 
     def _extrinsic_rows(self) -> list[CalibrationEstimate]:

@@ -96,7 +96,7 @@ def shift_directions(marker: Marker, side_m: float) -> Float:
 
 
 def side_prior(page_key: int, side_m: float, sigma_m: float) -> gtsam.CustomFactor:
-    """The rig's side length, with its tolerance. A page printed too small has small markers: `side = scale * side_m`."""
+    """The rig's side length, with its tolerance. A page printed small has small markers: `side = scale * side_m`."""
     row = np.array([[1.0, -side_m]])
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
