@@ -117,7 +117,7 @@ def test_knock_while_the_board_is_in_view():
 def test_an_id_twice_in_one_image():
     run = draw(Scenario.model_validate(SHORT), 1)
     others = [m for m in run.measurements if getattr(m, "marker", None) == 2]
-    away = [replace(m, corners_px=m.corners_px + [60.0, 0.0]) for m in others]
+    away = [replace(m, corners_px=m.corners_px + np.array([60.0, 0.0])) for m in others]
     doubled = replace(run, measurements=(*run.measurements, *away))
     result = estimate_run(doubled)
     assert_only(result, "marker_duplicated")
