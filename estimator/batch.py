@@ -60,8 +60,8 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-7)
-    parameters.setAbsoluteErrorTol(1e-7)
+    parameters.setRelativeErrorTol(1e-6)
+    parameters.setAbsoluteErrorTol(1e-4)
     parameters.setMaxIterations(40)
     parameters.setlambdaInitial(1e-8)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)

@@ -98,7 +98,7 @@ def settle_boards(engine: Engine, solution: BatchSolution) -> BatchSolution:
 def _look(engine: Engine, solution: BatchSolution) -> _Look:
     off = set(solution.outliers)
     active = [row for row in engine.solver.log.active() if row[0] not in off]
-    system = inflated_system(active, solution.values, ODOMETRY)
+    system, _ = inflated_system(active, solution.values, ODOMETRY)
     names, sigmas, C = inset_directions(engine.solver.log, active, system, solution.values, engine.boards)
     sides = [side_words(sheet.board.id) for sheet in engine.boards.sheets.values()]
     priors = [p for p, (_, _, r) in enumerate(active) if r.what in sides]

@@ -54,12 +54,10 @@ def displacement(
     spread = joint([keyframe, sheet.key])
     best: tuple[float, gtsam.Pose3, Float] | None = None
     for candidate in found:
-        camera_T_f = np.array(candidate.camera_T_f)
-        camera_T_f[:3, 3] *= scale
         own = candidate.covariance.copy()
         own[3:] *= scale
         own[:, 3:] *= scale
-        o_T_f = camera_poses[camera].compose(pose3(camera_T_f))
+        o_T_f = camera_poses[camera].compose(scaled_pose(candidate.camera_T_f, float(scale)))
         delta = gtsam.Pose3.Logmap(expected.between(o_T_f))
         to_camera = state.pose(keyframe).between(o_T_f)
         J = np.hstack([to_camera.inverse().AdjointMap(), -np.eye(6)])
@@ -70,6 +68,13 @@ def displacement(
     if best[0] < chi2.isf(rig.gates.gate_probability, 6):
         return None
     return Displaced(keyframe, stamp_ns, seen, best[1], best[2])
+
+
+def scaled_pose(camera_T_f: Float, scale: float) -> gtsam.Pose3:
+    """A pose that was found with the page as the rig has it, for the page as it is printed."""
+    scaled = np.array(camera_T_f)
+    scaled[:3, 3] *= scale
+    return pose3(scaled)
 
 
 def new_place(displaced: list[Displaced]) -> gtsam.Pose3 | None:

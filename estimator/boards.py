@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from ..factors import keys
 from ..factors.board import page_corners, page_factor, print_scale_prior, side_prior
@@ -12,8 +13,9 @@ from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.noise import gaussian, robust
 from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Rig
+from ..frontends.board_pose import board_pose_candidates
 from .board_inspection import FAMILY, Inspection
-from .board_moves import Joint, displacement, may_be_the_board, new_place, still_moving
+from .board_moves import Joint, displacement, may_be_the_board, new_place, scaled_pose, still_moving
 from .board_start import FirstPose, Side, inset_sigma_px
 from .graph import Record, State, Update
 from .result import CalibrationEstimate
@@ -89,16 +91,30 @@ class Boards:
 
     def known_corners(self, sightings: Sequence[MarkerSighting]) -> tuple[Float, Float]:
         """Corners of {o} that are known and seen: points (n, 3) and pixels (n, 2)."""
-        points, px = [], []
-        for sighting in sightings:
-            sheet = self.sheets[sighting.board]
-            marker = sheet.place(sighting.marker)
-            if sheet.known and (sighting.board, marker) in self._markers and marker not in sheet.loose:
-                points.append(self._predicted(sheet, marker))
-                px.append(sighting.corners_px)
-        if not points:
+        seen = self.usable(sightings)
+        if not seen:
             return np.zeros((0, 3)), np.zeros((0, 2))
-        return np.concatenate(points), np.concatenate(px)
+        points = [self._predicted(self.sheets[s.board], s.marker) for s in seen]
+        return np.concatenate(points), np.concatenate([s.corners_px for s in seen])
+
+    def usable(self, sightings: Sequence[MarkerSighting]) -> list[MarkerSighting]:
+        """Sightings of known boards, under the ids whose places they have, without loose markers."""
+        known = [(sheet, seen) for sheet, seen in self._by_sheet(sightings) if sheet.known]
+        return [s for sheet, seen in known for s in self.inspection.in_place(sheet, seen)]
+
+    def o_T_camera(self, seen: Sequence[MarkerSighting]) -> list[gtsam.Pose3]:
+        """Both poses of a camera from what it sees of one known board (the first of `usable` sightings)."""
+        sheet = self.sheets[seen[0].board]
+        mine = [s for s in seen if s.board == seen[0].board]
+        side, scale = self._state.vector(sheet.page)
+        camera, common = self._first.pinhole(seen[0].camera), self._rig.noise.marker_common_px
+        found = board_pose_candidates(mine, sheet.board, camera, float(side / scale), common)
+        o_T_f = self._state.pose(sheet.key)
+        return [o_T_f.compose(scaled_pose(c.camera_T_f, float(scale)).inverse()) for c in found]
+
+    def gate(self) -> float:
+        """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
+        return float(chi2.isf(self._rig.gates.gate_probability, 6))
 
     def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
         """Would a board get its first pose from these sightings of one frame alone?"""

@@ -18,8 +18,8 @@ FEWEST_PAIRS = 300
 LARGEST = 4.0
 
 
-def inflated_system(active: Active, values: gtsam.Values, family: str) -> LinearSystem:
-    """The linear system of factors at an estimate, its covariances those of correlated tracks."""
+def inflated_system(active: Active, values: gtsam.Values, family: str) -> tuple[LinearSystem, float]:
+    """The linear system of factors at an estimate, its covariances those of correlated tracks; and their factor."""
     graph = gtsam.NonlinearFactorGraph()
     for _, factor, _ in active:
         graph.add(factor)
@@ -28,7 +28,7 @@ def inflated_system(active: Active, values: gtsam.Values, family: str) -> Linear
     inflation = track_inflation(records, system, family)
     of_tracks = np.array([r.family == family for r in records])
     system.inflation[np.repeat(of_tracks, system.rows)] = inflation
-    return system
+    return system, inflation
 
 
 def track_inflation(records: list[Record], system: LinearSystem, family: str) -> float:

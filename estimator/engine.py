@@ -4,8 +4,7 @@ One engine serves offline and streaming. `add` takes all measurements of one sta
 hold something for the graph.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
 import gtsam
 import numpy as np
@@ -25,17 +24,20 @@ from ..factors.calibration import (
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose
-from ..factors.measurements import CloudFrame, Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.noise import sigmas
-from ..factors.rig import Rig
+from ..factors.rig import Distance, Rig
+from ..frontends.pick_image import CutOut
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
+from .bundle import Bundle
 from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
 from .observability import why_no_base
 from .odometry import FramePose, Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
+from .placement import place
 from .surfaces import Associator, Surfaces, SurfaceSettings
 
 Float = NDArray[np.float64]
@@ -48,20 +50,6 @@ COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
-
-
-@dataclass(frozen=True, slots=True)
-class Bundle:
-    """All measurements of one stamp."""
-
-    stamp_ns: int
-    frame: StereoFrame | None = None
-    sightings: tuple[MarkerSighting, ...] = ()
-    picks: tuple[Pick, ...] = ()
-    depths_m: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Surface depth and its sigma under the picks of this stamp, by point id, where it could be measured."""
-    outlines: tuple[OutlineSighting, ...] = ()
-    cloud: CloudFrame | None = None
 
 
 class Engine:
@@ -79,6 +67,10 @@ class Engine:
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
+        self.picks: list[Pick] = []
+        """All clicks, also those that were refused."""
+        self.pick_images: dict[tuple[str, int, str], CutOut] = {}
+        """What was clicked, by camera, stamp and point id, where there is an image."""
         self.keyframe_at: dict[int, int] = {}
         """Stamp to keyframe index."""
         self._recent: dict[int, tuple[StereoFrame, int, Float]] = {}
@@ -224,7 +216,7 @@ class Engine:
         if index == 0:
             found = gtsam.Pose3() if self._forced or self.boards.can_start(_mobile(bundle)) else None
         else:
-            found = self._resect(bundle)
+            found = place(self.boards, self.state, bundle.sightings, self._nearest(bundle.stamp_ns))
         if found is None:
             self._waiting.append(bundle)
             return None
@@ -239,28 +231,11 @@ class Engine:
         self._take(update)
         return index
 
-    def _resect(self, bundle: Bundle) -> gtsam.Pose3 | None:
-        """`o_T_m` from the corners of known boards in one of the mobile cameras."""
-        for camera in ("m_left", "m_right"):
-            seen = [s for s in bundle.sightings if s.camera == camera]
-            points, px = self.boards.known_corners(seen)
-            if len(points) < 4:
-                continue
-            guess = None
-            if len(points) < 8:
-                last = self.state.pose(keys.keyframe(self.odometry.last_keyframe))
-                guess = (last if camera == "m_left" else self._camera_poses_at(last)["m_right"]).matrix()
-            found = camera_pose(points, px, self.state.intrinsics(keys.intrinsics(camera)).K(), guess)
-            if found is None or found[1] > 5.0:
-                continue
-            pose = pose3(found[0])
-            if camera == "m_right":
-                pose = pose.compose(self.state.pose(keys.extrinsics("m_right")).inverse())
-            return pose
-        return None
-
-    def _camera_poses_at(self, o_T_m: gtsam.Pose3) -> dict[str, gtsam.Pose3]:
-        return {"m_left": o_T_m, "m_right": o_T_m.compose(self.state.pose(keys.extrinsics("m_right")))}
+    def _nearest(self, stamp_ns: int) -> tuple[gtsam.Pose3, int]:
+        """The keyframe nearest in time: its pose, and how far it is, ns."""
+        stamps = np.array(self.odometry.keyframe_stamps)
+        index = int(np.argmin(np.abs(stamps - stamp_ns)))
+        return self.state.pose(keys.keyframe(index)), int(abs(stamps[index] - stamp_ns))
 
     def revisit(self) -> None:
         """Frames that saw no known board get another chance, as long as that makes more boards known."""
@@ -352,7 +327,7 @@ class Engine:
                 continue
             update = Update()
             factor = distance_factor(a, b, distance.distance_m, sigmas([distance.sigma_m]))
-            what = f"distance {distance.point_a} to {distance.point_b}"
+            what = distance_name(distance)
             update.add(factor, Record(DISTANCES, what, stamp_ns, what, rejectable=False))
             self._take(update)
         self._distances_open = still
@@ -389,6 +364,7 @@ class Engine:
             self._pick(pick, bundle.depths_m.get(pick.point_id))
 
     def _pick(self, pick: Pick, depth_m: tuple[float, float] | None) -> None:
+        self.picks.append(pick)
         where = self.seen_from(pick.camera, pick.stamp_ns)
         if where is None:
             self.open_picks.append((pick, depth_m))
@@ -449,6 +425,11 @@ class Engine:
         return [*self.events, *self.boards.events]
 
 
+def distance_name(distance: Distance) -> str:
+    """How the factor of a known distance is called in its record."""
+    return f"distance {distance.point_a} to {distance.point_b}"
+
+
 def _prior(name: str, stamp_ns: int) -> Record:
     return Record("calibration priors", name, stamp_ns, f"prior of {name}", rejectable=False)
 
@@ -456,27 +437,3 @@ def _prior(name: str, stamp_ns: int) -> Record:
 def _mobile(bundle: Bundle) -> list[MarkerSighting]:
     """What the mobile cameras saw of boards."""
     return [s for s in bundle.sightings if s.camera != "b_rgb"]
-
-
-def bundles(measurements: Sequence[object]) -> list[Bundle]:
-    """Groups measurements of one stamp; they come out in the order of their stamps."""
-    groups: dict[int, list[object]] = {}
-    for m in measurements:
-        groups.setdefault(m.stamp_ns, []).append(m)  # type: ignore[attr-defined]
-    return [_bundle(stamp, group) for stamp, group in sorted(groups.items())]
-
-
-def _bundle(stamp_ns: int, group: list[object]) -> Bundle:
-    def of(kind: type) -> tuple:
-        return tuple(m for m in group if isinstance(m, kind))
-
-    frames, clouds = of(StereoFrame), of(CloudFrame)
-    return Bundle(
-        stamp_ns,
-        frames[0] if frames else None,
-        of(MarkerSighting),
-        of(Pick),
-        {},
-        of(OutlineSighting),
-        clouds[0] if clouds else None,
-    )

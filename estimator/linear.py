@@ -128,7 +128,7 @@ class LinearSystem:
                 continue
             right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
             at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
-            for column, start, stop in zip(columns, at[:-1], at[1:], strict=True):
+            for column, (start, stop) in zip(columns, pairwise(at), strict=True):
                 right[column, start:stop] = np.eye(stop - start)
             inverse = self.solve(right)
             outer = middle @ inverse

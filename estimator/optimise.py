@@ -75,7 +75,7 @@ def optimise(
                 "command": command,
             },
             [*pipeline.sensors.rejected],
-            [*_damage(reader, pipeline.engine.end_ns), *odd_stamps(pipeline.order, pipeline.engine.end_ns)],
+            [*_damage(reader, pipeline.engine.end_ns), *odd_stamps(pipeline.order, rig, pipeline.engine.end_ns)],
         )
     return result
 
@@ -96,12 +96,13 @@ def _damage(reader: LogReader, end_ns: int) -> list[Event]:
     return [Event(end_ns, "log_damaged", warning, "warning") for warning in reader.warnings]
 
 
-def odd_stamps(order: OrderReport, end_ns: int) -> list[Event]:
+def odd_stamps(order: OrderReport, rig: Rig, end_ns: int) -> list[Event]:
     """Stamps that run backwards or stand twice: the messages were sorted and used; whoever recorded should know."""
     told = []
+    several = {topic: n for topic, n in order.duplicated.items() if topic != rig.picks_topic}  # clicks in one picture
     for kind, counts, text in (
         ("stamps_backwards", order.backwards, "run backwards; the messages were sorted by stamp"),
-        ("stamps_duplicated", order.duplicated, "stand twice"),
+        ("stamps_duplicated", several, "stand twice"),
     ):
         for topic, count in sorted(counts.items()):
             told.append(Event(end_ns, kind, f"{topic}: {count} stamps {text}", "warning", {"messages": float(count)}))

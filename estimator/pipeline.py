@@ -11,12 +11,14 @@ from ..factors.errors import LogError, ObservabilityError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.fiducials.messages import UNKNOWN_IDS
+from ..frontends.pick_image import cut_out
 from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import predict_outline
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
-from .engine import Bundle, Engine
+from .bundle import Bundle
+from .engine import Engine
 from .pipes import AXIS_ROLES
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
@@ -65,6 +67,8 @@ class Pipeline:
         self._looked: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
         self._last_colour_ns: int | None = None
+        self._colour: ImageBody | None = None
+        """The Kinect's newest colour image, not decoded."""
 
     def run(self, messages: Iterable[Message]) -> Iterator[int]:
         """Takes messages in the order of the log; yields each stamp (ns) when it has been worked in."""
@@ -102,6 +106,7 @@ class Pipeline:
         if pair is not None:
             depths = {p.point_id: d for p in picks if (d := self.sensors.depth_under(p, pair)) is not None}
         self.engine.add(Bundle(stamp_ns, frame, tuple(sightings), tuple(picks), depths))
+        self._keep_pick_images(picks, pair, group)
         if pair is not None and stamp_ns in self.engine.keyframe_at:
             self._keep(pair)
             self._seek_outlines(picks, pair)
@@ -217,6 +222,20 @@ class Pipeline:
         self._kept_bytes += pair.nbytes
         while self._kept_bytes > KEPT_BYTES:
             self._kept_bytes -= self._kept.popleft().nbytes
+
+    def _keep_pick_images(self, picks: list[Pick], pair: PairImages | None, group: list[Item]) -> None:
+        """Cuts out what was clicked. The machine stands still: its newest colour image shows what a click there saw."""
+        for item in group:
+            if isinstance(item, Message) and isinstance(item.body, ImageBody):
+                self._colour = item.body if self._camera_of(item.topic) == "b_rgb" else self._colour
+        for pick in picks:
+            image = None
+            if pick.camera == "b_rgb":
+                image = None if self._colour is None else self._colour.pixels()
+            elif pair is not None:
+                image = pair.of(pick.camera)
+            if image is not None:
+                self.engine.pick_images[pick.camera, pick.stamp_ns, pick.point_id] = cut_out(image, pick.raw_px)
 
     def _seek_outlines(self, picks: list[Pick], pair: PairImages) -> None:
         """Edges of the pipe: about a pick at once; in all other keyframes once the pipe is known."""

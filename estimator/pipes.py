@@ -67,6 +67,10 @@ class Pipes:
         self.points: dict[str, _Point] = {}
         self.cylinders: dict[str, _Cylinder] = {p.id: _Cylinder(i, p) for i, p in enumerate(rig.pipes)}
         self.rejected: list[Rejection] = []
+        self.clicked: list[tuple[SeenFrom, Pick]] = []
+        """Picks that are in the graph, in the order of their entry."""
+        self.outlined: list[tuple[SeenFrom, OutlineSighting]] = []
+        """Outlines that are in the graph."""
 
     def pipe_of(self, point_id: str) -> str:
         """The pipe that a point is on."""
@@ -128,6 +132,7 @@ class Pipes:
             factor = mobile_projection(pick.camera, pick.px, model, where.key, key)
         what = f"pick {pick.point_id} in {pick.camera}"
         update.add(factor, Record(FAMILY, f"picks {pick.point_id}", pick.stamp_ns, what, camera=pick.camera))
+        self.clicked.append((where, pick))
         point.picks += 1
         point.stamp_ns = max(point.stamp_ns, pick.stamp_ns)
 
@@ -263,6 +268,7 @@ class Pipes:
             what = f"edge {side} of {cylinder.pipe.id} in {sighting.camera}"
             source = f"outline {sighting.camera}"
             update.add(factor, Record(OUTLINE, source, sighting.stamp_ns, what, camera=sighting.camera))
+        self.outlined.append((where, sighting))
         cylinder.outlines += 1
 
     def _attach(self, point: _Point, update: Update) -> None:

@@ -1,5 +1,7 @@
 """Points, axes and radii in {b}, with covariance from the joint of `o_T_b` and what is seen from it."""
 
+from functools import cache
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -37,9 +39,15 @@ def radius95(covariance: Float) -> float:
     return float(root)  # pyright: ignore[reportArgumentType]  # without full_output it is a number
 
 
+@cache
+def _quadrature() -> tuple[Float, Float]:
+    """Gauss-Legendre nodes and weights on (-1, 1)."""
+    return np.polynomial.legendre.leggauss(64)
+
+
 def _inside(radius: float, sigma: Float) -> float:
     """Probability of a centred trivariate normal within a sphere; `sigma` in descending order."""
-    nodes, weights = np.polynomial.legendre.leggauss(64)
+    nodes, weights = _quadrature()
     angles = (nodes + 1) * np.pi / 4
     reach = min(radius, 8.5 * sigma[0])
     x = (nodes + 1) / 2 * reach

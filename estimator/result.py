@@ -164,6 +164,30 @@ class PickView:
 
 
 @dataclass(frozen=True, slots=True)
+class PickRecord:
+    """One click of the operator, also where it was refused."""
+
+    point_id: str
+    role: str
+    camera: str
+    stamp_ns: int
+    pixel: Float
+    """Shape (2,), as clicked, OpenCV convention."""
+    sigma_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceMap:
+    """What was seen of the surroundings: landmarks of the mobile camera and the Kinect's surface."""
+
+    frame: str
+    points: bytes
+    """Rows of (x, y, z, sigma) in m, float32, little-endian. Sigma is the point's own, as if all poses were known."""
+    landmarks: int
+    """The first so many rows are landmarks, the rest is the Kinect's."""
+
+
+@dataclass(frozen=True, slots=True)
 class Result:
     """Everything that was estimated from one recording."""
 
@@ -190,3 +214,5 @@ class Result:
     advice: dict[str, tuple[Advice, ...]] = field(default_factory=dict)
     """What to measure next, by point id, best first."""
     pick_views: tuple[PickView, ...] = ()
+    picks: tuple[PickRecord, ...] = ()
+    surroundings: SurfaceMap | None = None

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..factors.errors import SurecutError
-from .result import NearestSurface, PipeEstimate, PointEstimate, PoseEstimate, Result
+from .result import NearestSurface, PickRecord, PickView, PipeEstimate, PointEstimate, PoseEstimate, Result
 
 FORMAT = 1
 NON_FINITE = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
@@ -32,6 +32,8 @@ HEAD = ("surecut", "log_sha256", "rig_sha256")
 SHAPES: dict[type, dict[str, tuple[int, ...]]] = {
     PointEstimate: {"position_m": (3,), "covariance_m2": (3, 3), "axis": (3,), "budget": (3, 3)},
     NearestSurface: {"direction": (3,)},
+    PickRecord: {"pixel": (2,)},
+    PickView: {"pixel": (2,), "ellipse_px2": (2, 2)},
     PoseEstimate: {"matrix": (4, 4), "covariance": (6, 6)},
     PipeEstimate: {"point_m": (3,), "axis": (3,), "covariance": (7, 7)},
 }

@@ -4,19 +4,25 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from ..factors.errors import ObservabilityError, RigError
+from ..factors.geometry import pose_from_vectors
+from ..factors.rig import load_rig
 from ..io.build import (
     point_with_covariance_array,
     pose_stamped,
     pose_with_covariance_stamped,
     tf_message,
 )
-from ..io.build_views import covariance_cloud, diagnostic_array, marker_array_ellipsoids
+from ..io.build_views import covariance_cloud, diagnostic_array, marker_array_ellipsoids, point_cloud2
 from ..io.writer import McapSink
 from .result import PoseEstimate, Result
 from .result_json import to_json
+from .surroundings import map_rows
+
+Float = NDArray[np.float64]
 
 POSE = "geometry_msgs/msg/PoseStamped"
 Level = Literal["ok", "warn", "error", "stale"]
@@ -32,6 +38,7 @@ def write_result(path: Path, result: Result) -> None:
     with McapSink(path) as sink:
         _write_poses(sink, result)
         _write_points(sink, result)
+        _write_map(sink, result)
         _write_diagnostics(sink, result)
         sink.attach("result.json", "application/json", to_json(result), result.end_ns)
         sink.attach("rig.yaml", "application/yaml", result.config_yaml, result.end_ns)
@@ -71,6 +78,16 @@ def _write_points(sink: McapSink, result: Result) -> None:
     sink.write("/estimate/points_ellipsoids", "visualization_msgs/msg/MarkerArray", ellipsoids, stamp)
 
 
+def _write_map(sink: McapSink, result: Result) -> None:
+    """The surroundings as a cloud with each point's own sigma, for viewers."""
+    if result.surroundings is None:
+        return
+    rows = map_rows(result.surroundings)
+    columns = {name: np.ascontiguousarray(rows[:, i]) for i, name in enumerate(("x", "y", "z", "sigma"))}
+    cloud = point_cloud2(result.end_ns, result.surroundings.frame, columns)
+    sink.write("/estimate/map", "sensor_msgs/msg/PointCloud2", cloud, result.end_ns)
+
+
 def _write_diagnostics(sink: McapSink, result: Result) -> None:
     consistency = result.consistency
     rows: list[tuple[Level, str, str, dict[str, str]]] = []
@@ -97,11 +114,38 @@ def _write_diagnostics(sink: McapSink, result: Result) -> None:
         sink.write("/estimate/rejected", "diagnostic_msgs/msg/DiagnosticArray", status, rejection.stamp_ns)
 
 
-def tum_text(result: Result) -> str:
-    """`o_T_m` in TUM format: time [s], translation [m], quaternion x y z w; one line per frame."""
+def tum_text(result: Result, frame: Literal["o", "world"] = "o") -> str:
+    """The trajectory of {m} in TUM format: time [s], translation [m], quaternion x y z w; one line per frame.
+
+    Args:
+        frame: `o`, or the frame that the rig's `world_board` defines.
+
+    Raises:
+        SurecutError: there is no such frame.
+    """
+    frame_T_o = world_T_o(result) if frame == "world" else np.eye(4)
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for pose in result.trajectory:
-        q = Rotation.from_matrix(pose.matrix[:3, :3]).as_quat()
-        numbers = " ".join(f"{x:.9f}" for x in np.concatenate([pose.matrix[:3, 3], q]))
+        matrix = frame_T_o @ pose.matrix
+        q = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+        numbers = " ".join(f"{x:.9f}" for x in np.concatenate([matrix[:3, 3], q]))
         lines.append(f"{pose.stamp_ns // 10**9}.{pose.stamp_ns % 10**9:09d} {numbers}")
     return "\n".join(lines) + "\n"
+
+
+def world_T_o(result: Result) -> Float:
+    """{o} in the frame that the rig's `world_board` defines, shape (4, 4): `world_T_f * o_T_f^-1`.
+
+    Raises:
+        RigError: the rig gives no such board. ObservabilityError: the log never placed it.
+    """
+    world = load_rig(result.config_yaml.encode()).world_board
+    if world is None:
+        raise RigError("the rig defines no frame world; add the section `world_board` (board, world_T_f)")
+    o_T_f = next((pose.matrix for pose in result.poses if pose.name == world.board), None)
+    if o_T_f is None:
+        raise ObservabilityError(
+            f"the frame world is not observable: its board {world.board} was never seen well enough to be placed"
+        )
+    world_T_f = pose_from_vectors(world.world_T_f.translation_m, world.world_T_f.rotation_vector_rad).matrix()
+    return world_T_f @ np.linalg.inv(o_T_f)

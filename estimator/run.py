@@ -8,7 +8,8 @@ from ..factors.measurements import Event, Rejection
 from ..factors.rig import Rig
 from .batch import solve
 from .board_faults import settle_boards
-from .engine import Engine, bundles
+from .bundle import bundles
+from .engine import Engine
 from .result import Result
 from .summary import Summary
 from .surfaces import Associator

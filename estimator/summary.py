@@ -1,5 +1,7 @@
 """From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -9,13 +11,18 @@ from ..factors.board import mean_point
 from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
+from ..factors.measurements import Event
 from ..factors.rig import dump_rig
+from . import dark_uncertainty
+from .advice import advise
 from .batch import BatchSolution
+from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .correlation import Active, inflated_system
-from .engine import Engine
+from .engine import Engine, distance_name
 from .marker_points import parse_point
 from .odometry import FAMILY as ODOMETRY
+from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
     CalibrationEstimate,
@@ -26,6 +33,7 @@ from .result import (
     PoseEstimate,
     Result,
 )
+from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
 
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
@@ -41,7 +49,7 @@ class Summary:
         self._solution = solution
         off = set(solution.outliers)
         self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        self._system = inflated_system(self._active, solution.values, ODOMETRY)
+        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -49,13 +57,18 @@ class Summary:
         engine = self._engine
         consistency = self._consistency()
         points = self._points()
+        distances = self._distances(between)
+        self._tell_corner_rms()
+        pipes = self._pipes(points)
+        around = surroundings(engine, self._values, self._system)
+        points = tuple(self._with_surface(p, pipes, around) for p in points)
         return Result(
             points=points,
             poses=self._poses(),
             trajectory=self._trajectory(),
-            pipes=self._pipes(points),
+            pipes=pipes,
             calibration=self._calibration(),
-            distances=self._distances(between),
+            distances=distances,
             consistency=consistency,
             rejected=(*engine.everything_rejected(), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
@@ -65,7 +78,19 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
+            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            pick_views=pick_views(engine, self._values, self._system),
+            picks=pick_records(engine),
+            surroundings=compact_map(around),
         )
+
+    def _tell_corner_rms(self) -> None:
+        """Distance of the accepted corners from where the solution puts them."""
+        corners = [f for _, f, r in self._active if r.family == CORNERS and isinstance(f, gtsam.NoiseModelFactor)]
+        if corners:
+            rms = float(np.sqrt(np.mean([np.sum(f.unwhitenedError(self._values) ** 2) for f in corners])))
+            text = f"{len(corners)} marker corners lie {rms:.2f} px (rms) from where the solution puts them"
+            self._engine.events.append(Event(self._engine.end_ns, "corner_rms", text, "info", {"rms_px": rms}))
 
     # Points ---------------------------------------------------------------------------------------------------
 
@@ -96,6 +121,16 @@ class Summary:
             pipe_id=point.pipe if point.on_axis else None,
             budget=self._budget(influence),
         )
+
+    def _with_surface(
+        self, point: PointEstimate, pipes: tuple[PipeEstimate, ...], around: Surroundings | None
+    ) -> PointEstimate:
+        """What is next to a point on a pipe. Without a pipe the map cannot be told from what is to be cut."""
+        own = next((pipe for pipe in pipes if pipe.id == point.pipe_id), None)
+        if own is None or around is None:
+            return point
+        key = keys.point(self._engine.pipes.points[point.id].index)
+        return replace(point, nearest_surface=nearest_surface(around, point, own, key, self._values, self._system))
 
     def _axis(self, index: int) -> Float:
         o_T_b = self._values.atPose3(keys.base(0))
@@ -251,6 +286,7 @@ class Summary:
     def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
         rig = self._engine.rig
         found = []
+        dark = self._dark_variance()
         asked = [(d.point_a, d.point_b, d.distance_m, d.sigma_m) for d in rig.distances]
         for a, b, given, given_sigma in [*asked, *((a, b, None, None) for a, b in between)]:
             estimate = self._distance(a, b)
@@ -258,8 +294,18 @@ class Summary:
                 if given is None:
                     raise ObservabilityError(f"distance {a} to {b}: one of the two markers was never placed by the log")
                 continue
-            found.append(DistanceEstimate(f"{a} to {b}", *estimate, given, given_sigma))
+            length, sigma = estimate
+            found.append(DistanceEstimate(f"{a} to {b}", length, float(np.hypot(sigma, dark**0.5)), given, given_sigma))
         return tuple(found)
+
+    def _dark_variance(self) -> float:
+        """Variance that the given distances show beyond the model; tells the user."""
+        sigmas = {distance_name(d): d.sigma_m for d in self._engine.rig.distances}
+        rows = [(i, sigmas[r.what]) for i, (_, _, r) in enumerate(self._active) if r.what in sigmas]
+        variance = dark_uncertainty.of_distances(self._system, [i for i, _ in rows], np.array([s for _, s in rows]))
+        if variance > 0.0:
+            self._engine.events.append(dark_uncertainty.event(variance, len(rows), self._engine.end_ns))
+        return variance
 
     def _distance(self, a: str, b: str) -> tuple[float, float] | None:
         points = [self._engine.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]

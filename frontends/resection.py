@@ -53,4 +53,4 @@ def _vectors(guess: Float | None) -> tuple[Float, Float]:
     if guess is None:
         return np.zeros(3), np.zeros(3)
     c_T_o = np.linalg.inv(guess)
-    return np.asarray(cv2.Rodrigues(c_T_o[:3, :3])[0], np.float64), np.asarray(c_T_o[:3, 3], np.float64)
+    return np.asarray(cv2.Rodrigues(c_T_o[:3, :3])[0], np.float64), np.array(c_T_o[:3, 3], np.float64)

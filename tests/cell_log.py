@@ -1,4 +1,4 @@
-"""A small recording of a cell, written in a moment: detected markers of one board from a moving stereo camera, and picks.
+"""A small recording of a cell, written in a moment: markers of one board seen by a moving stereo camera, and picks.
 
 The messages come as a list, so that a test can spoil what it is about before the log is written.
 """
@@ -103,7 +103,9 @@ def markers(topic: str, stamp: int, seen: dict[int, np.ndarray]) -> Entry:
     return Entry(topic, MARKERS, stamp, lambda t: build.marker_detections(t, "m", "DICT_4X4_50", seen))
 
 
-def pick(stamp: int, camera: str, u: float, v: float, point: str = "P1", role: str = "cut", sigma: float = 1.0) -> Entry:
+def pick(
+    stamp: int, camera: str, u: float, v: float, point: str = "P1", role: str = "cut", sigma: float = 1.0
+) -> Entry:
     return Entry("/picks", PICK, stamp, lambda t: build.pixel_pick(t, camera, point, role, (u, v), sigma))
 
 
@@ -134,7 +136,9 @@ def pictures(moments: int) -> list[tuple[np.ndarray, np.ndarray]]:
 def _wall() -> np.ndarray:
     """Grey values of the plane of the page, 1 mm a pixel, 3 m by 2 m about its centre, y up."""
     rng = np.random.default_rng(5)
-    coarse = [cv2.resize(rng.normal(size=(n, 3 * n // 2)), (3000, 2000), interpolation=cv2.INTER_CUBIC) for n in (40, 160)]
+    coarse = [
+        cv2.resize(rng.normal(size=(n, 3 * n // 2)), (3000, 2000), interpolation=cv2.INTER_CUBIC) for n in (40, 160)
+    ]
     wall = np.clip(110 + 35 * coarse[0] + 30 * coarse[1], 0, 255)
     wall[850:1150, 1395:1605] = 230
     for marker, (x, y) in CENTRES.items():

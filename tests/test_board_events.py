@@ -7,7 +7,8 @@ import pytest
 from board_scene import STEP_NS, board_before, lens, page, pair, right_of, seen, seen_by_pair
 from scipy.stats import chi2
 
-from surecut.estimator.engine import Engine, bundles
+from surecut.estimator.bundle import bundles
+from surecut.estimator.engine import Engine
 from surecut.estimator.run import estimate
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors.rig import Board, Marker, Rig

@@ -30,13 +30,13 @@ def problem(landmarks: int, keyframes: int, chain: bool):
         if chain and k:
             earlier = values.atPose3(keys.keyframe(k - 1))
             noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
-            graph.add(
-                gtsam.BetweenFactorPose3(keys.keyframe(k - 1), keys.keyframe(k), earlier.between(pose), noise)
-            )
+            graph.add(gtsam.BetweenFactorPose3(keys.keyframe(k - 1), keys.keyframe(k), earlier.between(pose), noise))
     return graph, values
 
 
-@pytest.mark.parametrize(("landmarks", "keyframes", "chain"), [(0, 5, False), (0, 5, True), (12, 4, False), (12, 4, True)])
+@pytest.mark.parametrize(
+    ("landmarks", "keyframes", "chain"), [(0, 5, False), (0, 5, True), (12, 4, False), (12, 4, True)]
+)
 def test_covariances_are_those_of_the_dense_inverse(landmarks, keyframes, chain):
     graph, values = problem(landmarks, keyframes, chain)
     system = LinearSystem(graph, values)

@@ -1,9 +1,11 @@
 """Estimate pipe points in {b}, poses and calibration from recorded logs, jointly and with covariances."""
 
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -42,6 +44,10 @@ class Job:
     json: Path | None
     tum: Path | None
     between: tuple[tuple[str, str], ...]
+    frame: Literal["o", "world"]
+    """Of the trajectory in TUM format."""
+    command: str = ""
+    """As the user typed it."""
 
 
 def command(
@@ -53,7 +59,10 @@ def command(
     json: Annotated[
         Path | None, typer.Option("--json", help="Machine-readable result; a folder for several logs.")
     ] = None,
-    tum: Annotated[Path | None, typer.Option("--tum", help="Trajectory of {m} in {o}, TUM format.")] = None,
+    tum: Annotated[Path | None, typer.Option("--tum", help="Trajectory of {m}, TUM format.")] = None,
+    frame: Annotated[
+        Literal["o", "world"], typer.Option("--frame", help="Frame of --tum; `world` is that of the rig's world_board.")
+    ] = "o",
     between: Annotated[
         list[str] | None,
         typer.Option("--between", help="Distance between two marker points, such as '29/0 60/0' or '3 7'."),
@@ -67,7 +76,7 @@ def command(
     several = len(logs) > 1
     if several and tum is not None and not tum.is_dir():
         raise typer.BadParameter("--tum must be an existing folder for several logs")
-    work = [_job(log, output, rig, json, tum, pairs, several) for log in logs]
+    work = [_job(log, output, rig, json, tum, pairs, frame, several) for log in logs]
     for job in work:
         if job.output is not None and job.output.resolve() == job.log.resolve():
             raise SurecutError(f"{job.log}: would be overwritten by its own result; give another -o")
@@ -90,14 +99,16 @@ def _pair(text: str) -> tuple[str, str]:
 
 def _job(
     log: Path, output: Path | None, rig: Path | None, json: Path | None, tum: Path | None,
-    between: tuple[tuple[str, str], ...], several: bool,
+    between: tuple[tuple[str, str], ...], frame: Literal["o", "world"], several: bool,
 ) -> Job:  # fmt: skip
     def place(target: Path | None, suffix: str) -> Path | None:
         if target is None:
             return None
         return target / f"{log.stem}{suffix}" if several or target.is_dir() else target
 
-    return Job(log, place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"), between)
+    typed = shlex.join(["surecut", *sys.argv[1:]])
+    places = (place(output, ".estimate.mcap"), rig, place(json, ".json"), place(tum, ".tum"))
+    return Job(log, *places, between, frame, typed)
 
 
 def _done(job: Job) -> bool:
@@ -116,7 +127,7 @@ def _done(job: Job) -> bool:
 
 def run_job(job: Job) -> str:
     """One log; returns one line. Top level, so that processes and clusters can take it."""
-    result = optimise(job.log, job.rig, job.between)
+    result = optimise(job.log, job.rig, job.between, command=job.command)
     _write(job, result)
     radius = max((p.radius95_m for p in result.points), default=float("nan"))
     state = "consistent" if result.consistency.passed else "INCONSISTENT"
@@ -132,7 +143,7 @@ def _write(job: Job, result: Result) -> None:
     if job.json is not None:
         write_text(job.json, to_json(result))
     if job.tum is not None:
-        write_text(job.tum, tum_text(result))
+        write_text(job.tum, tum_text(result, job.frame))
 
 
 def _with_progress(job: Job) -> Result:
@@ -153,7 +164,7 @@ def _with_progress(job: Job) -> Result:
         def advance(stamp_ns: int) -> None:
             bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
-        result = optimise(job.log, job.rig, job.between, advance)
+        result = optimise(job.log, job.rig, job.between, advance, job.command)
     _write(job, result)
     return result
 

@@ -16,8 +16,10 @@ from .text import decimals, duration, fixed, mm, mm_with, utc
 Float = NDArray[np.float64]
 
 NO_VERDICT = "NO VERDICT"
-ADVICE_SHOWN = 5
-BARS_SHOWN = 8
+K1 = 1.96
+"""Coverage factor of a single number for 95 %."""
+ADVICE_SHOWN = 4
+BARS_SHOWN = 6
 VIEWS_SHOWN = 4
 
 
@@ -44,6 +46,7 @@ def detail_pages(result: Result, point: PointEstimate, first: bool) -> Iterator[
     directions = triad(point)
     yield Heading(f"{heading(point)}: the numbers behind it", 1, new_page=first)
     yield _ellipsoid(point, directions)
+    yield from _next_to_it(point)
     yield from _budget_table(point, directions)
     yield from _images(result, point)
 
@@ -151,6 +154,16 @@ def _ellipsoid(point: PointEstimate, directions: Triad) -> Table:
     )
 
 
+def _next_to_it(point: PointEstimate) -> Iterator[Block]:
+    surface = point.nearest_surface
+    if surface is not None:
+        apart = mm_with(surface.distance_m, K1 * surface.sigma_m)
+        yield Paragraph(
+            f"The nearest mapped surface that is not the pipe itself: {apart} from the point ({surface.what}; expanded "
+            f"uncertainty with k = {K1:.2f})."
+        )
+
+
 def budget_rows(point: PointEstimate) -> list[tuple[str, Float]]:
     """Sources and contributions, shape (3, 3) each, largest trace first."""
     return sorted(point.budget.items(), key=lambda item: (-float(np.trace(item[1])), item[0]))
@@ -235,7 +248,7 @@ def _advice(result: Result, point: PointEstimate) -> Iterator[Block]:
         header=("Do this", "How", "95 % within", "gain"),
         rows=rows,
         numeric=(2, 3),
-        widths=(0.28, 0.42, 0.2, 0.1),
+        widths=(0.3, 0.42, 0.19, 0.09),
     )
 
 

@@ -207,7 +207,7 @@ def _rejections(result: Result) -> Iterator[Block]:
     rows: list[tuple[str, ...]] = []
     for (family, reason), members in ordered[:REASONS_SHOWN]:
         _, value, limit, what = max(members, key=lambda m: (abs(m[1] - m[2]), m[3]))
-        rows.append((str(len(members)), family, reason, f"{what}: {value:.3g} against {limit:.3g}"))
+        rows.append((str(len(members)), family, reason, _worst(what, value, limit)))
     yield Table(
         caption="Refused measurements by reason; of each the one that missed its limit by most.",
         header=("Number", "Family", "Reason", "Worst"),
@@ -215,6 +215,13 @@ def _rejections(result: Result) -> Iterator[Block]:
         numeric=(0,),
         widths=(0.09, 0.2, 0.35, 0.36),
     )
+
+
+def _worst(what: str, value: float, limit: float) -> str:
+    """The number that decided, where there is one; a limit of zero stands for none."""
+    if not np.isfinite(value):
+        return what
+    return f"{what}: {value:.3g} against {limit:.3g}" if limit else f"{what}: {value:.3g}"
 
 
 def _streaming(result: Result) -> Iterator[Block]:
@@ -233,14 +240,27 @@ def _streaming(result: Result) -> Iterator[Block]:
 def _provenance(result: Result) -> Iterator[Block]:
     yield Heading("Where it comes from")
     rows = sorted(result.provenance.items())
-    picks = sorted({(view.stamp_ns, view.point_id, view.camera) for view in result.pick_views})
     yield Table(
         caption="Versions, hashes and command.",
         header=("", ""),
-        rows=(
-            *rows,
-            ("end of the recording", utc(result.end_ns)),
-            *((f"pick of {point}", f"{camera}, {utc(stamp)}") for stamp, point, camera in picks),
-        ),
+        rows=(*rows, ("end of the recording", utc(result.end_ns))),
         widths=(0.25, 0.75),
     )
+    if result.picks:
+        yield Table(
+            caption="The operator's picks: pixels as clicked, with the standard uncertainty of the click.",
+            header=("Point", "Role", "Camera", "When", "pixel", "± px"),
+            rows=tuple(
+                (
+                    p.point_id,
+                    p.role,
+                    p.camera,
+                    utc(p.stamp_ns),
+                    f"{p.pixel[0]:.1f}, {p.pixel[1]:.1f}",
+                    f"{p.sigma_px:.2g}",
+                )
+                for p in sorted(result.picks, key=lambda p: (p.stamp_ns, p.point_id, p.camera))
+            ),
+            numeric=(4, 5),
+            widths=(0.12, 0.12, 0.14, 0.34, 0.18, 0.1),
+        )

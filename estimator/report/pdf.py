@@ -235,6 +235,8 @@ def _keep_headings(story: list[Flowable]) -> list[Flowable]:
             continue
         if isinstance(flowable, _Heading) and not isinstance(last, PageBreak | _Heading):
             kept.append(CondPageBreak(32 * mm))
+        elif isinstance(flowable, PageBreak) and isinstance(last, Spacer):
+            kept.pop()  # on a full page it would go to a page of its own
         elif isinstance(flowable, _Caption):
             kept.append(CondPageBreak(18 * mm))
         kept.append(flowable)

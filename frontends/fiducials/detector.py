@@ -12,7 +12,8 @@ from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort, undistorted_grid
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
-from .pattern_fit import PatternFit, Window, fit_patterns, surroundings
+from .pattern_fit import PatternFit, fit_patterns
+from .pixel_choice import Window, surroundings
 from .search import Candidate, MarkerSearch
 
 Float = NDArray[np.float64]
