@@ -68,7 +68,7 @@ class Pipeline:
         self._kept_bytes = 0
         self._looked: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
-        self._last_colour_ns = 0
+        self._last_colour_ns: int | None = None
         self._colour: ImageBody | None = None
         """The Kinect's newest colour image, not decoded."""
 
@@ -137,9 +137,18 @@ class Pipeline:
             camera = self._camera_of(item.topic)
             if isinstance(item.body, DetectionsBody) and camera is not None:
                 found += self.sensors.detections(camera, stamp_ns, item.body)
+            if isinstance(item.body, ImageBody) and camera == "b_rgb" and self._colour_due(stamp_ns):
+                found += self.sensors.markers("b_rgb", stamp_ns, item.body.pixels())
         if {"m_left", "m_right"} <= {s.camera for s in found}:
             self._sides.look(found, self.sensors.cameras, self.sensors.left_T_right())
         return found
+
+    def _colour_due(self, stamp_ns: int) -> bool:
+        """Is it time to look for boards in the machine's colour image?"""
+        due = self._last_colour_ns is None or stamp_ns - self._last_colour_ns >= COLOUR_PERIOD_NS
+        if due:
+            self._last_colour_ns = stamp_ns
+        return due
 
     def _camera_of(self, topic: str) -> str | None:
         for name in ("m_left", "m_right", "b_rgb"):

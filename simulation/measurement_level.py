@@ -13,6 +13,7 @@ from ..estimator.baseline import ClickedPoint
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
+from .measurement_level_board import misprinted
 from .measurement_level_machine import clicks, cloud_frames, stereo_clicks
 from .measurement_level_mobile import marker_sightings, stereo_frames
 from .measurement_level_scenario import Scenario
@@ -98,6 +99,8 @@ def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
         if scenario.faults
         else nominal_rig(rig, nominal, scenario.baseline_m)
     )
+    first = rig.boards[0].id
+    true.boards[first] = misprinted(true.boards[first], scenario.board)
     w_T_f = {rig.boards[0].id: scene.w_T_b @ invert(true.f_T_b)}
     stamps_s, w_T_m, places_s = mobile_path(scene, w_T_f[rig.boards[0].id][:3, 3], scenario.motion, rng)
     stamps_ns = tuple(START_NS + round(1e9 * float(t)) for t in stamps_s)

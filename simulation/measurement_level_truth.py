@@ -137,7 +137,7 @@ def draw_board(board: Board, rng: np.random.Generator | None, lasting_m: float =
     """A page with its print errors: common scale, single centres, apparent side. Without `rng`: as described."""
     n = len(board.markers)
     print_scale = 1.0 + (0.0 if rng is None else float(rng.normal(0.0, board.print_scale_sigma)))
-    side_m = board.side_m + (0.0 if rng is None else float(rng.normal(0.0, board.side_sigma_m)))
+    side_m = print_scale * board.side_m + (0.0 if rng is None else float(rng.normal(0.0, board.side_sigma_m)))
     centres_m = np.zeros((n, 3))
     centres_m[:, :2] = print_scale * np.array([marker.centre_m for marker in board.markers])
     ragged_m = np.zeros((n, 4, 3))
