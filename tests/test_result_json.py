@@ -136,7 +136,20 @@ def test_no_result_at_all(text):
 def test_missing_keys_and_wrong_types_even_under_a_fitting_hash():
     good = json.loads(to_json(full_result()))
     for key in [
-        k for k in good if k not in ("surecut", "log_sha256", "rig_sha256", "format", "sha256", "advice", "pick_views")
+        k
+        for k in good
+        if k
+        not in (
+            "surecut",
+            "log_sha256",
+            "rig_sha256",
+            "format",
+            "sha256",
+            "advice",
+            "pick_views",
+            "picks",
+            "surroundings",
+        )
     ]:
         with pytest.raises(ResultError, match=f"lacks {key}"):
             from_json(reseal({k: v for k, v in good.items() if k != key}))
