@@ -108,7 +108,6 @@ def test_a_better_mount_leaves_what_was_predicted():
     result = result_of(run)
     advice = next(a for a in result.advice["P2"] if a.action == "Measure the mount again")
     assert advice.gain > 0.05
-    assert any(a.action == "Average more Kinect images" for a in result.advice["P2"])
     mount = run.rig.mount.model_copy(update={"translation_sigma_m": 5e-4, "rotation_sigma_rad": 0.000875})
     after = estimate(run.measurements, run.rig.model_copy(update={"mount": mount}), run.cameras, lay_on_surfaces)
     assert after.points[1].radius95_m == pytest.approx(advice.predicted_radius95_m, rel=0.03)

@@ -28,9 +28,9 @@ class OutlineConfig:
     click_sigma_px: float = 1.5
     limits: PairLimits = field(default_factory=PairLimits)
     refined_pairs: int = 7
-    refined_known: int = 3
-    """Of these where width and place are known beforehand."""
     """Hypotheses that get the sub-pixel fit."""
+    refined_known: int = 3
+    """The same where width and place are known beforehand."""
     lowest_quality: float = 0.8
     largest_sigma_px: float = 0.5
     """An edge whose place is less sure than this is no measurement."""
