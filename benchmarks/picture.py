@@ -1,6 +1,6 @@
 """The README's picture, from a recording and its result: what the camera saw, and the cell from above.
 
-    python benchmarks/picture.py logs/demo.mcap logs/demo.json docs/picture.png
+python benchmarks/picture.py logs/demo.mcap logs/demo.json docs/picture.png
 """
 
 import sys

@@ -150,8 +150,8 @@ def second_board(
     new.insert(keys.board(index), o_T_f)
     new.insert(keys.page(index), np.array([board.side_m, 1.0]))
     page = keys.page(index)
-    found += [Predicted(side_prior(page, board, board.side_m, board.side_sigma_m))]
-    found += [Predicted(print_scale_prior(page, board))]
+    found += [Predicted(side_prior(page, board.side_m, board.side_sigma_m))]
+    found += [Predicted(print_scale_prior(page, board.print_scale_sigma))]
     common = scene.engine.rig.noise.marker_common_px
     colour = sigmas([scene.sigma(CORNERS, "b_rgb", float(np.hypot(CORNER_SIGMA_PX, common)))] * 2)
     away = float(np.linalg.norm(o_T_f.translation() - view.o_T_m.translation()))

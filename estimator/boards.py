@@ -1,7 +1,6 @@
 """Boards in the graph: where a page starts from, its corners, side length and scale, and what contradicts the rig."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -9,47 +8,33 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ..factors import keys
-from ..factors.board import DIRECTIONS, marker_rotation, page_corners, page_factor, print_scale_prior, side_prior
-from ..factors.geometry import pose3
+from ..factors.board import page_corners, page_factor, print_scale_prior, side_prior
 from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.noise import gaussian, robust
 from ..factors.projection import machine_projection, mobile_projection
-from ..factors.rig import Board, Marker, Rig
-from ..frontends.resection import PlanarPose, page_pose_and_side, planar_poses
+from ..factors.rig import Rig
+from ..frontends.board_pose import board_pose_candidates
+from .board_inspection import FAMILY, Inspection
+from .board_moves import Joint, displacement, may_be_the_board, new_place, scaled_pose, still_moving
+from .board_start import FirstPose, Side, inset_sigma_px
 from .graph import Record, State, Update
+from .result import CalibrationEstimate
+from .sheet import Displaced, Knock, PageFactor, Sheet
 from .view_cells import ViewCells
 
 Float = NDArray[np.float64]
 
-FAMILY = "marker corners"
 GEOMETRY = "board geometry"
 DISTANCES = "known distances"
 FREE_SIDE_REL = 0.5
 """Sigma of a side length whose given value the log contradicts: it says no more than that there is one."""
 SIDE_GATE_SIGMA = 5.0
-VIEWS_TO_DECIDE = 3
-"""A first pose that stays ambiguous after so many keyframes takes the better of the two and says so."""
-
-
-@dataclass(slots=True)
-class _Sheet:
-    """One board's standing in the graph."""
-
-    index: int
-    board: Board
-    epoch: int = 0
-    known: bool = False
-    page_known: bool = False
-    slots: dict[int, int] = field(default_factory=dict)
-    """Marker id to slot, of the present epoch."""
-    held: list[tuple[int, list[MarkerSighting]]] = field(default_factory=list)
-    """Keyframe key and sightings, until the first pose is sure."""
-    views: dict[str, int] = field(default_factory=dict)
-    last_seen_ns: int | None = None
-
-    @property
-    def key(self) -> int:
-        return keys.board(self.index, self.epoch)
+LOOK_AGAIN_PX = 1.0
+"""Common shift of a board against its predicted place from which on the prediction is made exact and tested."""
+HELD_VIEWS = 40
+"""Views of a board without a pose that are kept."""
+STILL_VIEWS = 40
+"""Views of a board from one place after which further ones are left out: they would count one part in so many."""
 
 
 class Boards:
@@ -58,66 +43,124 @@ class Boards:
     def __init__(self, rig: Rig, state: State) -> None:
         self._rig = rig
         self._state = state
-        self._sheets = {board.id: _Sheet(i, board) for i, board in enumerate(rig.boards)}
+        self.sheets = {board.id: Sheet(i, board) for i, board in enumerate(rig.boards)}
         self._markers = {(b.id, m.id): m for b in rig.boards for m in b.markers}
         self._next_slot = 0
         self._cells: dict[tuple[str, str], ViewCells] = {}
-        self.events: list[Event] = []
-        self.rejected: list[Rejection] = []
+        self._first = FirstPose(rig, state)
+        self.inspection = Inspection(rig, state, self._first.pinhole)
+        self._told: dict[tuple[str, str], Event] = {}
+        self._refused: list[Rejection] = []
+        self.insets: list[CalibrationEstimate] = []
+        """After the run: how far the corners lie inside the true ones, by camera and board."""
+        self.inset_sigma_px: dict[tuple[str, str], float] = {}
+        """By camera and board: how far its corners may all lie inside (or outside) of the true ones."""
+
+    # What others ask ------------------------------------------------------------------------------------------
+
+    @property
+    def events(self) -> list[Event]:
+        """What contradicts the rig, as far as it is known."""
+        return [*self._told.values(), *self.inspection.events.values()]
+
+    @property
+    def rejected(self) -> list[Rejection]:
+        return [*self._refused, *self.inspection.rejected]
 
     def known(self, board: str) -> bool:
         """Has the board a pose in the graph?"""
-        return self._sheets[board].known
+        return self.sheets[board].known
 
     def any_known(self) -> bool:
-        return any(sheet.known for sheet in self._sheets.values())
+        return any(sheet.known for sheet in self.sheets.values())
 
     def key(self, board: str) -> int:
-        return self._sheets[board].key
+        return self.sheets[board].key
 
     def index(self, board: str) -> int:
-        return self._sheets[board].index
+        return self.sheets[board].index
 
     def last_seen_ns(self) -> int | None:
         """Stamp of the newest accepted sighting of any board."""
-        return max((s.last_seen_ns for s in self._sheets.values() if s.last_seen_ns is not None), default=None)
+        return max((s.last_seen_ns for s in self.sheets.values() if s.last_seen_ns is not None), default=None)
+
+    def slot_of(self, board: str, marker: int) -> int | None:
+        """The corner slot of a printed marker, None before it was seen."""
+        sheet = self.sheets[board]
+        return sheet.slots.get(sheet.place(marker))
 
     def known_corners(self, sightings: Sequence[MarkerSighting]) -> tuple[Float, Float]:
         """Corners of {o} that are known and seen: points (n, 3) and pixels (n, 2)."""
-        points, px = [], []
-        for sighting in sightings:
-            sheet = self._sheets[sighting.board]
-            if sheet.known:
-                points.append(self._predicted(sheet, sighting.marker))
-                px.append(sighting.corners_px)
-        if not points:
+        seen = self.usable(sightings)
+        if not seen:
             return np.zeros((0, 3)), np.zeros((0, 2))
-        return np.concatenate(points), np.concatenate(px)
+        points = [self._predicted(self.sheets[s.board], s.marker) for s in seen]
+        return np.concatenate(points), np.concatenate([s.corners_px for s in seen])
+
+    def usable(self, sightings: Sequence[MarkerSighting]) -> list[MarkerSighting]:
+        """Sightings of known boards, under the ids whose places they have, without loose markers."""
+        known = [(sheet, seen) for sheet, seen in self._by_sheet(sightings) if sheet.known]
+        return [s for sheet, seen in known for s in self.inspection.in_place(sheet, seen)]
 
     def o_T_camera(self, seen: Sequence[MarkerSighting]) -> list[gtsam.Pose3]:
-        """Both poses of a camera from what it sees of one known board (the first sighting's)."""
-        sheet = self._sheets[seen[0].board]
+        """Both poses of a camera from what it sees of one known board (the first of `usable` sightings)."""
+        sheet = self.sheets[seen[0].board]
         mine = [s for s in seen if s.board == seen[0].board]
-        K = self._state.intrinsics(keys.intrinsics(seen[0].camera)).K()
-        side = float(self._state.vector(keys.page(sheet.index))[0])
+        side, scale = self._state.vector(sheet.page)
+        camera, common = self._first.pinhole(seen[0].camera), self._rig.noise.marker_common_px
+        found = board_pose_candidates(mine, sheet.board, camera, float(side / scale), common)
         o_T_f = self._state.pose(sheet.key)
-        return [
-            o_T_f.compose(pose3(p.camera_T_plane).inverse())
-            for p in self._candidates(sheet.board, mine, K, (side, None))
-        ]
+        return [o_T_f.compose(scaled_pose(c.camera_T_f, float(scale)).inverse()) for c in found]
 
-    def _predicted(self, sheet: _Sheet, marker: int) -> Float:
-        """Corners of a marker in {o}, shape (4, 3), from the board's pose and page."""
-        side, scale = self._state.vector(keys.page(sheet.index))
-        page = page_corners(self._markers[sheet.board.id, marker], side, scale)
-        return np.array([self._state.pose(sheet.key).transformFrom(corner) for corner in page])
+    def gate(self) -> float:
+        """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
+        return float(chi2.isf(self._rig.gates.gate_probability, 6))
+
+    def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
+        """Would a board get its first pose from these sightings of one frame alone?"""
+        for sheet, seen in self._by_sheet(sightings):
+            enough = min(2, len(sheet.board.markers))
+            for camera in {s.camera for s in seen}:
+                mine = [s for s in seen if s.camera == camera]
+                if len({s.marker for s in mine}) >= enough and np.isinf(self._first.margin(sheet, mine)):
+                    return True
+        return False
+
+    def margin(self, seen: Sequence[MarkerSighting]) -> float:
+        """Chi-square by which an image rules out the second pose of its best board; infinite where it does."""
+        return max((self._first.margin(sheet, mine) for sheet, mine in self._by_sheet(seen)), default=-1.0)
+
+    def _by_sheet(self, sightings: Sequence[MarkerSighting]) -> list[tuple[Sheet, list[MarkerSighting]]]:
+        found = []
+        for name, sheet in self.sheets.items():
+            seen = [s for s in sightings if s.board == name and (name, s.marker) in self._markers]
+            if seen:
+                found.append((sheet, seen))
+        return found
+
+    # A keyframe -----------------------------------------------------------------------------------------------
+
+    def displaced(self, camera_poses: Mapping[str, gtsam.Pose3], sightings: Sequence[MarkerSighting]) -> bool:
+        """Is a known board off its predicted place? The cameras should then be placed as well as can be."""
+        return any(
+            self._off(sheet, camera_poses, self.inspection.in_place(sheet, seen))
+            for sheet, seen in self._by_sheet(sightings)
+            if sheet.known
+        )
+
+    def _off(self, sheet: Sheet, camera_poses: Mapping[str, gtsam.Pose3], seen: list[MarkerSighting]) -> bool:
+        if sheet.displaced:
+            return True
+        shifts = [np.linalg.norm(np.median(shift, axis=0)) for _, shift in self._shifts(sheet, camera_poses, seen)]
+        return bool(max(shifts, default=0.0) > LOOK_AGAIN_PX)
 
     def add(
         self,
         keyframe: int,
-        camera_poses: dict[str, gtsam.Pose3],
+        camera_poses: Mapping[str, gtsam.Pose3],
         sightings: Sequence[MarkerSighting],
         force: bool = False,
+        joint: Joint | None = None,
     ) -> Update:
         """Sightings at a keyframe.
 
@@ -125,178 +168,137 @@ class Boards:
             keyframe: key of the pose that the cameras hang on (`o_T_m` or `o_T_b`).
             camera_poses: `o_T_c` of each camera as believed now.
             force: a board starts even from a view that allows two poses.
+            joint: joint covariances of the running solver, where something other than boards places the cameras: a
+                board may then be found displaced.
         """
         update = Update()
-        for name, sheet in self._sheets.items():
-            seen = [s for s in sightings if s.board == name and (name, s.marker) in self._markers]
-            if not seen:
+        for sheet, seen in self._by_sheet(sightings):
+            if sheet.first_seen_ns is None:
+                sheet.first_seen_ns = seen[0].stamp_ns
+            good = self.inspection.trusted(sheet, seen)
+            if not good:
                 continue
             if not sheet.known:
-                sheet.held.append((keyframe, seen))
-                if not self._start(sheet, camera_poses, seen, update, force):
-                    continue
-                held, sheet.held = sheet.held, []
-                for key, earlier in held:
-                    self._observe(sheet, key, None, earlier, update)
-            else:
-                self._observe(sheet, keyframe, camera_poses, seen, update)
+                self._hold(sheet, keyframe, good)
+                self._start(sheet, camera_poses, good, update, force)
+            elif joint is None or not self._elsewhere(sheet, keyframe, camera_poses, good, joint, update):
+                self._observe(sheet, keyframe, camera_poses, good, update)
         return update
 
     # First pose -----------------------------------------------------------------------------------------------
 
-    def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
-        """Would a board get its first pose from these sightings of one frame alone?"""
-        by_view: dict[tuple[str, str], list[MarkerSighting]] = {}
-        for s in sightings:
-            by_view.setdefault((s.board, s.camera), []).append(s)
-        return any(self.margin(seen) > self.gate() for seen in by_view.values())
-
-    def margin(self, seen: list[MarkerSighting]) -> float:
-        """Chi-square by which the second pose of a board in one image is worse than the first; infinite for one."""
-        sheet = self._sheets[seen[0].board]
-        K = self._state.intrinsics(keys.intrinsics(seen[0].camera)).K()
-        side = self._side(sheet, seen, K)
-        poses = self._candidates(sheet.board, seen, K, side)
-        here = {seen[0].camera: gtsam.Pose3()}
-        scores = sorted(self._score(sheet.board, here, seen, pose3(p.camera_T_plane), side) for p in poses)
-        if not scores:
-            return -1.0
-        return scores[1] - scores[0] if len(scores) > 1 else float("inf")
-
-    def gate(self) -> float:
-        """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
-        return float(chi2.ppf(1 - self._rig.gates.gate_probability, 6))
+    def _hold(self, sheet: Sheet, keyframe: int, seen: list[MarkerSighting]) -> None:
+        sheet.held.append((keyframe, seen))
+        if len(sheet.held) > HELD_VIEWS:
+            _, dropped = sheet.held.pop(1)
+            self._refuse(sheet, dropped, "board not placed for long, views held", len(sheet.held), HELD_VIEWS)
 
     def _start(
         self,
-        sheet: _Sheet,
-        camera_poses: dict[str, gtsam.Pose3],
+        sheet: Sheet,
+        camera_poses: Mapping[str, gtsam.Pose3],
         seen: list[MarkerSighting],
         update: Update,
-        force: bool = False,
-    ) -> bool:
-        """Gives the board its first pose when one is sure; adds its variables and priors."""
-        camera = max(camera_poses, key=lambda c: sum(s.camera == c for s in seen))
-        mine = [s for s in seen if s.camera == camera]
-        K = self._state.intrinsics(keys.intrinsics(camera)).K()
-        side = self._side(sheet, mine, K)
-        candidates = self._candidates(sheet.board, mine, K, side)
-        poses = [camera_poses[camera].compose(pose3(p.camera_T_plane)) for p in candidates]
-        if not poses:
-            return False
-        scores = [self._score_of_held(sheet, pose, side) for pose in poses]
-        order = np.argsort(scores)
-        if len(poses) > 1 and scores[order[1]] - scores[order[0]] < self.gate():
-            if len(sheet.held) < VIEWS_TO_DECIDE and not force:
-                return False
+        force: bool,
+    ) -> None:
+        """Gives the board its first pose when one is sure; adds its variables and priors, and what was held back."""
+        start = self._first.find(sheet, camera_poses, seen, force)
+        if start is None:
+            return
+        if not start.sure:
             text = f"board {sheet.board.id} starts from a view that allows two poses; took the better one"
-            self._say(seen[0].stamp_ns, "ambiguous_start", text, "info")
-        update.guess(sheet.key, poses[int(order[0])])
-        self._open_page(sheet, side, seen[0].stamp_ns, update)
+            self.say(seen[0].stamp_ns, "ambiguous_start", sheet.board.id, text, "info")
+        update.guess(sheet.key, start.o_T_f)
+        self._open_page(sheet, start.side, seen[0].stamp_ns, update)
         sheet.known = True
-        return True
+        held, sheet.held = sheet.held, []
+        for key, earlier in held:
+            usable = [s for s in earlier if s.marker not in sheet.loose]
+            self._observe(sheet, key, None, usable, update)
 
-    def _score_of_held(self, sheet: _Sheet, o_T_f: gtsam.Pose3, side: tuple[float, float | None]) -> float:
-        """Chi-square of a pose over all views that were held back."""
-        total = 0.0
-        for key, seen in sheet.held:
-            poses = {s.camera: self._camera_pose(key, s.camera) for s in seen}
-            total += self._score(sheet.board, poses, seen, o_T_f, side)
-        return total
-
-    def _camera_pose(self, key: int, camera: str) -> gtsam.Pose3:
-        pose = self._state.pose(key)
-        return pose if camera == "m_left" else pose.compose(self._state.pose(keys.extrinsics(camera)))
-
-    def _side(self, sheet: _Sheet, seen: list[MarkerSighting], K: Float) -> tuple[float, float | None]:
-        """Side length to start with, and the sigma with which the image itself knows it (None: not at all)."""
-        markers = [self._markers[sheet.board.id, s.marker] for s in seen]
-        centres = np.array([[*m.centre_m, 0.0] for m in markers])
-        halves = np.array([0.5 * DIRECTIONS @ marker_rotation(m).T for m in markers])
-        px = np.array([s.corners_px for s in seen])
-        sigma = np.array([np.sqrt(np.trace(s.covariance_px2, axis1=1, axis2=2) / 2) for s in seen])
-        implied = page_pose_and_side(centres, halves, px, sigma, K, sheet.board.side_m)
-        if implied is None:
-            return sheet.board.side_m, None
-        return implied
-
-    @staticmethod
-    def _candidates(
-        board: Board, seen: list[MarkerSighting], K: Float, side: tuple[float, float | None]
-    ) -> list[PlanarPose]:
-        lookup = {m.id: m for m in board.markers}
-        plane = np.concatenate([page_corners(lookup[s.marker], side[0]) for s in seen])
-        return planar_poses(plane, np.concatenate([s.corners_px for s in seen]), K)
-
-    def _score(
-        self,
-        board: Board,
-        camera_poses: dict[str, gtsam.Pose3],
-        seen: list[MarkerSighting],
-        o_T_f: gtsam.Pose3,
-        side: tuple[float, float | None],
-    ) -> float:
-        """Chi-square of a pose over all cameras that see the board now."""
-        total = 0.0
-        for s in seen:
-            o_p = [o_T_f.transformFrom(c) for c in page_corners(self._markers[board.id, s.marker], side[0])]
-            residual = s.corners_px - self._pixels(s.camera, camera_poses[s.camera], np.array(o_p))
-            total += float(np.einsum("ni,nij,nj->", residual, np.linalg.inv(s.covariance_px2), residual))
-        return total
-
-    def _pixels(self, camera: str, o_T_c: gtsam.Pose3, points: Float) -> Float:
-        c_p = (points - o_T_c.translation()) @ o_T_c.rotation().matrix()
-        K = self._state.intrinsics(keys.intrinsics(camera)).K()
-        return (c_p @ K.T)[:, :2] / c_p[:, 2:]
-
-    def _open_page(self, sheet: _Sheet, side: tuple[float, float | None], stamp_ns: int, update: Update) -> None:
+    def _open_page(self, sheet: Sheet, side: Side, stamp_ns: int, update: Update) -> None:
         """Side length and scale as states; a given side that the image contradicts does not enter."""
         if sheet.page_known:
             return
-        board, page = sheet.board, keys.page(sheet.index)
-        update.guess(page, np.array([side[0], 1.0]))
-        sigma = board.side_sigma_m
-        if side[1] is not None:
-            off = abs(side[0] - board.side_m) / np.hypot(side[1], board.side_sigma_m)
+        board, mean, sigma = sheet.board, sheet.board.side_m, sheet.board.side_sigma_m
+        update.guess(sheet.page, np.array([side.length_m, 1.0]))
+        if side.sigma_m is not None:
+            off = abs(side.length_m - mean) / float(np.hypot(side.sigma_m, sigma))
             if off > SIDE_GATE_SIGMA:
-                sigma = FREE_SIDE_REL * side[0]
-                text = (
-                    f"board {board.id}: the rig says side {1e3 * board.side_m:.1f} mm, the log says "
-                    f"{1e3 * side[0]:.1f} +/- {1e3 * side[1]:.1f} mm; used the log's"
-                )
-                self._say(
-                    stamp_ns,
-                    "side_length_wrong",
-                    text,
-                    "warning",
-                    given_m=board.side_m,
-                    seen_m=side[0],
-                    sigma_m=side[1],
-                )
-                self.rejected.append(
-                    Rejection(stamp_ns, GEOMETRY, f"side of board {board.id}", "off by sigmas", off, SIDE_GATE_SIGMA)
-                )
-        mean = board.side_m if sigma == board.side_sigma_m else side[0]
-        what = f"side of board {board.id}"
-        update.add(side_prior(page, board, mean, sigma), Record(GEOMETRY, what, stamp_ns, what, rejectable=False))
-        what = f"print scale of board {board.id}"
-        update.add(print_scale_prior(page, board), Record(DISTANCES, what, stamp_ns, what, rejectable=False))
+                self.say_side(sheet, stamp_ns, side.length_m, side.sigma_m)
+                self.reject_side(sheet, stamp_ns, off)
+                mean, sigma = side.length_m, FREE_SIDE_REL * side.length_m
+        what = side_words(board.id)
+        update.add(side_prior(sheet.page, mean, sigma), Record(GEOMETRY, what, stamp_ns, what, rejectable=False))
+        what = scale_words(board.id)
+        factor = print_scale_prior(sheet.page, board.print_scale_sigma)
+        update.add(factor, Record(DISTANCES, what, stamp_ns, what, rejectable=False))
         sheet.page_known = True
+
+    # A new place ----------------------------------------------------------------------------------------------
+
+    def _elsewhere(
+        self,
+        sheet: Sheet,
+        keyframe: int,
+        camera_poses: Mapping[str, gtsam.Pose3],
+        seen: list[MarkerSighting],
+        joint: Joint,
+        update: Update,
+    ) -> bool:
+        """A board that is not where it was: its views wait until they agree on a new place."""
+        view = None
+        if self._off(sheet, camera_poses, seen):
+            state, rig, pinhole = self._state, self._rig, self._first.pinhole
+            view = displacement(sheet, keyframe, camera_poses, seen, state, rig, pinhole, joint)
+        if view is None:
+            self._forget(sheet, sheet.displaced)
+            return False
+        if view.o_T_f is None and not sheet.displaced:
+            return False
+        sheet.displaced.append(view)
+        self._forget(sheet, still_moving(sheet.displaced))
+        place = new_place(sheet.displaced) if may_be_the_board(sheet, keyframe) else None
+        if place is not None:
+            self._reopen(sheet, place, update)
+        return True
+
+    def _forget(self, sheet: Sheet, views: Sequence[Displaced]) -> None:
+        for view in views:
+            self._refuse(sheet, view.seen, "board not in its place, views that agree", 1.0, 3.0)
+        sheet.displaced = [v for v in sheet.displaced if not any(v is gone for gone in views)]
+
+    def _reopen(self, sheet: Sheet, place: gtsam.Pose3, update: Update) -> None:
+        """The board goes on with a pose and corners of its own; what was tied to the old ones stays with them."""
+        views, sheet.displaced = sheet.displaced, []
+        sheet.knocks.append(Knock(sheet.last_seen_ns or views[0].stamp_ns, views[0].stamp_ns, sheet.epoch + 1))
+        old = self._state.pose(sheet.key)
+        sheet.epoch += 1
+        sheet.slots = {}
+        update.guess(sheet.key, place)
+        delta = gtsam.Pose3.Logmap(old.between(place))
+        self.say_knock(sheet, sheet.knocks[-1], delta, None)
+        for view in views:
+            self._observe(sheet, view.keyframe, None, view.seen, update)
 
     # Corners --------------------------------------------------------------------------------------------------
 
     def _observe(
         self,
-        sheet: _Sheet,
+        sheet: Sheet,
         keyframe: int,
-        camera_poses: dict[str, gtsam.Pose3] | None,
+        camera_poses: Mapping[str, gtsam.Pose3] | None,
         seen: list[MarkerSighting],
         update: Update,
     ) -> None:
         accepted = seen if camera_poses is None else self._gated(sheet, camera_poses, seen)
         for sighting in accepted:
-            slot = self._slot(sheet, sighting, update)
             covariance = self._with_common_part(sheet, keyframe, sighting, update)
+            if covariance is None:
+                continue
+            self._note_source(sighting)
+            slot = self._slot(sheet, sighting, update)
+            source = f"corners {sighting.camera} {sheet.board.id}"
             for i in range(4):
                 model = robust(gaussian(covariance[i]), self._rig.gates.robust_sigma)
                 point = keys.corner(slot, i)
@@ -305,33 +307,44 @@ class Boards:
                 else:
                     factor = mobile_projection(sighting.camera, sighting.corners_px[i], model, keyframe, point)
                 what = f"marker {sighting.marker} corner {i} in {sighting.camera}"
-                update.add(
-                    factor,
-                    Record(
-                        FAMILY,
-                        f"corners {sighting.camera} {sheet.board.id}",
-                        sighting.stamp_ns,
-                        what,
-                        camera=sighting.camera,
-                    ),
-                )
+                update.add(factor, Record(FAMILY, source, sighting.stamp_ns, what, camera=sighting.camera))
             sheet.last_seen_ns = max(sheet.last_seen_ns or 0, sighting.stamp_ns)
 
+    def _note_source(self, sighting: MarkerSighting) -> None:
+        """How far the detector of these corners may be biased."""
+        key = (sighting.camera, sighting.board)
+        sigma = inset_sigma_px(sighting, self._rig.noise)
+        self.inset_sigma_px[key] = max(sigma, self.inset_sigma_px.get(key, 0.0))
+
+    def _predicted(self, sheet: Sheet, marker: int) -> Float:
+        """Corners of a marker in {o}, shape (4, 3), from the board's pose and page."""
+        side, scale = self._state.vector(sheet.page)
+        page = page_corners(self._markers[sheet.board.id, marker], side, scale)
+        return np.array([self._state.pose(sheet.key).transformFrom(corner) for corner in page])
+
+    def _pixels(self, camera: str, o_T_c: gtsam.Pose3, points: Float) -> Float:
+        c_p = (points - o_T_c.translation()) @ o_T_c.rotation().matrix()
+        K = self._state.intrinsics(keys.intrinsics(camera)).K()
+        return (c_p @ K.T)[:, :2] / c_p[:, 2:]
+
+    def _shifts(
+        self, sheet: Sheet, camera_poses: Mapping[str, gtsam.Pose3], seen: list[MarkerSighting]
+    ) -> list[tuple[list[MarkerSighting], Float]]:
+        """By camera: its sightings, and by how much each marker's middle is off its predicted place, (n, 2) px."""
+        found = []
+        for camera in sorted({s.camera for s in seen}):
+            mine = [s for s in seen if s.camera == camera]
+            expected = [self._pixels(camera, camera_poses[camera], self._predicted(sheet, s.marker)) for s in mine]
+            shifts = [(s.corners_px - e).mean(0) for s, e in zip(mine, expected, strict=True)]
+            found.append((mine, np.array(shifts)))
+        return found
+
     def _gated(
-        self, sheet: _Sheet, camera_poses: dict[str, gtsam.Pose3], seen: list[MarkerSighting]
+        self, sheet: Sheet, camera_poses: Mapping[str, gtsam.Pose3], seen: list[MarkerSighting]
     ) -> list[MarkerSighting]:
         """Refuses markers that sit elsewhere than the rest of what the same image shows of the board."""
         good = []
-        for camera in {s.camera for s in seen}:
-            mine = [s for s in seen if s.camera == camera]
-            shifts = np.array(
-                [
-                    (s.corners_px - self._pixels(camera, camera_poses[camera], self._predicted(sheet, s.marker))).mean(
-                        0
-                    )
-                    for s in mine
-                ]
-            )
+        for mine, shifts in self._shifts(sheet, camera_poses, seen):
             common = np.median(shifts, axis=0)
             for s, shift in zip(mine, shifts, strict=True):
                 size = float(np.linalg.norm(s.corners_px[0] - s.corners_px[2])) / np.sqrt(2)
@@ -340,66 +353,130 @@ class Boards:
                 if off < limit:
                     good.append(s)
                 else:
-                    what = f"marker {s.marker} of board {sheet.board.id} in {camera}"
-                    self.rejected.append(Rejection(s.stamp_ns, FAMILY, what, "off its place by px", off, limit))
+                    self._refuse(sheet, [s], "off its place by px", off, limit)
         return good
 
-    def _slot(self, sheet: _Sheet, sighting: MarkerSighting, update: Update) -> int:
+    def _slot(self, sheet: Sheet, sighting: MarkerSighting, update: Update) -> int:
         """The marker's corner variables, made on its first sighting."""
         if sighting.marker in sheet.slots:
             return sheet.slots[sighting.marker]
         slot = sheet.slots[sighting.marker] = self._next_slot
         self._next_slot += 1
-        marker: Marker = self._markers[sheet.board.id, sighting.marker]
-        in_update = update.values.exists(sheet.key)
-        o_T_f = update.values.atPose3(sheet.key) if in_update else self._state.pose(sheet.key)
-        page = keys.page(sheet.index)
+        marker = self._markers[sheet.board.id, sighting.marker]
+        o_T_f = self._pose_of(sheet.key, update)
+        page = sheet.page
         side, scale = update.values.atVector(page) if update.values.exists(page) else self._state.vector(page)
         for i, corner in enumerate(page_corners(marker, side, scale)):
             update.guess(keys.corner(slot, i), o_T_f.transformFrom(corner))
-        what = f"marker {sighting.marker} lies on page {sheet.board.id}"
+        after = f" after knock {sheet.epoch}" if sheet.epoch else ""
+        what = f"marker {sighting.marker} lies on page {sheet.board.id}{after}"
         factor = page_factor(sheet.board, marker, sheet.key, page, slot, self._detection_error_m(sighting, side))
         update.add(factor, Record(GEOMETRY, f"page {sheet.board.id}", sighting.stamp_ns, what, rejectable=False))
+        sheet.pages[what] = PageFactor(sighting.marker, slot, sheet.epoch, self._detection_error_m(sighting, side))
         return slot
+
+    def _pose_of(self, key: int, update: Update) -> gtsam.Pose3:
+        return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
         """A corner's lasting detection error on the page, from its size in this first view."""
         diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
         return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
 
-    def _with_common_part(self, sheet: _Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float:
-        """Adds the part of a corner's error that views from the same place share.
+    def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
+        """Adds the part of a corner's error that views from the same place share; None where they are plenty.
 
         Views are counted per cell of viewing position; the n-th view of a cell gets n times the common variance, so
         that standing still gives no more than one view's worth of it.
         """
         cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
         if cells.last != keyframe:
-            held = update.values.exists(keyframe)
-            pose = update.values.atPose3(keyframe) if held else self._state.pose(keyframe)
-            board = update.values.atPose3(sheet.key) if update.values.exists(sheet.key) else self._state.pose(sheet.key)
-            cells.count(keyframe, board.between(pose).matrix())
+            view = self._pose_of(sheet.key, update).between(self._pose_of(keyframe, update))
+            cells.count(keyframe, view.matrix())
+        if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
+            self._refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
+            return None
         return sighting.covariance_px2 + np.eye(2) * self._rig.noise.marker_common_px**2 * cells.views
 
-    def slot_of(self, board: str, marker: int) -> int | None:
-        """The corner slot of a marker, None before it was seen."""
-        return self._sheets[board].slots.get(marker)
+    # Book-keeping ---------------------------------------------------------------------------------------------
 
     def held_back(self) -> list[Rejection]:
-        """Sightings of boards that never got a pose."""
-        return [
-            Rejection(
-                s.stamp_ns,
-                FAMILY,
-                f"marker {s.marker} of board {sheet.board.id} in {s.camera}",
-                "board never placed: views",
-                float(len(sheet.held)),
-                float(VIEWS_TO_DECIDE),
-            )
-            for sheet in self._sheets.values()
-            for _, seen in sheet.held
-            for s in seen
-        ]
+        """Sightings of boards that never got a pose, or not the one that these show."""
+        found = []
+        for sheet in self.sheets.values():
+            for _, seen in sheet.held:
+                found += [_rejection(sheet, s, "board never placed: views", len(sheet.held), 1.0) for s in seen]
+            for view in sheet.displaced:
+                reason = "board not in its place, views that agree"
+                found += [_rejection(sheet, s, reason, len(sheet.displaced), 3.0) for s in view.seen]
+        return found
 
-    def _say(self, stamp_ns: int, kind: str, text: str, severity: str, **values: float) -> None:
-        self.events.append(Event(stamp_ns, kind, text, severity, values))  # type: ignore[arg-type]
+    def _refuse(self, sheet: Sheet, seen: Sequence[MarkerSighting], reason: str, value: float, limit: float) -> None:
+        self._refused += [_rejection(sheet, s, reason, value, limit) for s in seen]
+
+    def say(self, stamp_ns: int, kind: str, board: str, text: str, severity: str, **values: float) -> None:
+        """Tells something about a board; a later word on the same replaces it."""
+        self._told[kind, board] = Event(stamp_ns, kind, text, severity, values)  # type: ignore[arg-type]
+
+    def told(self, kind: str, board: str) -> Event | None:
+        """What was said about a board."""
+        return self._told.get((kind, board))
+
+    def unsay(self, kind: str, board: str) -> None:
+        """Takes back what did not hold."""
+        self._told.pop((kind, board), None)
+
+    def say_side(self, sheet: Sheet, stamp_ns: int, side_m: float, sigma_m: float) -> None:
+        board = sheet.board
+        text = (
+            f"board {board.id}: the rig says side {1e3 * board.side_m:.1f} mm, the log says {1e3 * side_m:.1f} +/- "
+            f"{1e3 * sigma_m:.1f} mm; used the log's"
+        )
+        values = {"given_m": board.side_m, "seen_m": side_m, "sigma_m": sigma_m}
+        self.say(stamp_ns, "side_length_wrong", board.id, text, "warning", **values)
+
+    def reject_side(self, sheet: Sheet, stamp_ns: int, off: float) -> None:
+        what = side_words(sheet.board.id)
+        self._refused.append(Rejection(stamp_ns, GEOMETRY, what, "off by sigmas", off, SIDE_GATE_SIGMA))
+
+    def say_knock(self, sheet: Sheet, knock: Knock, delta: Float, covariance: Float | None) -> None:
+        """`delta`: tangent of old_T_new, rotation first; `covariance` (6, 6) where it is known already."""
+        angle, length = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
+        sigmas = (0.0, 0.0)
+        moved, turned = f"{1e3 * length:.1f} mm", f"{np.degrees(angle):.2f} deg"
+        if covariance is not None:
+            u, v = delta[:3] / max(angle, 1e-9), delta[3:] / max(length, 1e-9)
+            sigmas = float(np.sqrt(u @ covariance[:3, :3] @ u)), float(np.sqrt(v @ covariance[3:, 3:] @ v))
+            moved = f"{1e3 * length:.1f} +/- {1e3 * sigmas[1]:.1f} mm"
+            turned = f"{np.degrees(angle):.2f} +/- {np.degrees(sigmas[0]):.2f} deg"
+        mount = self._rig.mount
+        tied = mount is not None and mount.board == sheet.board.id
+        void = "; the mount (f_T_b) holds for the time before only" if tied else ""
+        text = (
+            f"board {sheet.board.id} was knocked between {1e-9 * knock.before_ns:.2f} s and "
+            f"{1e-9 * knock.after_ns:.2f} s: moved by {moved}, turned by {turned}; it has a new pose from then on{void}"
+        )
+        values = {
+            "before_ns": float(knock.before_ns),
+            "moved_m": length,
+            "moved_sigma_m": sigmas[1],
+            "turned_rad": angle,
+            "turned_sigma_rad": sigmas[0],
+        }
+        name = f"{sheet.board.id} {knock.epoch}"
+        self.say(knock.after_ns, "board_knocked", name, text, "warning", **values)
+
+
+def side_words(board: str) -> str:
+    """The side prior's name in the records."""
+    return f"side of board {board}"
+
+
+def scale_words(board: str) -> str:
+    """The print scale prior's name in the records."""
+    return f"print scale of board {board}"
+
+
+def _rejection(sheet: Sheet, s: MarkerSighting, reason: str, value: float, limit: float) -> Rejection:
+    what = f"marker {s.marker} of board {sheet.board.id} in {s.camera}"
+    return Rejection(s.stamp_ns, FAMILY, what, reason, float(value), float(limit))

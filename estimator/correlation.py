@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,10 +10,25 @@ from .graph import Record
 from .linear import LinearSystem
 
 Float = NDArray[np.float64]
+Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
+"""Factors with their index in the log and their record."""
 
 FEWEST_VIEWS = 8
 FEWEST_PAIRS = 300
 LARGEST = 4.0
+
+
+def inflated_system(active: Active, values: gtsam.Values, family: str) -> tuple[LinearSystem, float]:
+    """The linear system of factors at an estimate, its covariances those of correlated tracks; and their factor."""
+    graph = gtsam.NonlinearFactorGraph()
+    for _, factor, _ in active:
+        graph.add(factor)
+    system = LinearSystem(graph, values)
+    records = [record for _, _, record in active]
+    inflation = track_inflation(records, system, family)
+    of_tracks = np.array([r.family == family for r in records])
+    system.inflation[np.repeat(of_tracks, system.rows)] = inflation
+    return system, inflation
 
 
 def track_inflation(records: list[Record], system: LinearSystem, family: str) -> float:

@@ -22,11 +22,13 @@ from ..factors.calibration import (
     stereo_prior,
 )
 from ..factors.camera import CameraModel
+from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose
-from ..factors.measurements import Event, OutlineSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.noise import sigmas
 from ..factors.rig import Distance, Rig
 from ..frontends.pick_image import CutOut
+from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .bundle import Bundle
 from .graph import Record, State, Update
@@ -43,6 +45,11 @@ Float = NDArray[np.float64]
 MARKER_KEYFRAMES = 10
 """Keyframes of markers alone that share an update: each stands on known boards already, and every update touches the
 corners of all of them."""
+
+COLOUR_VIEWS = 60
+"""Colour images of boards that wait for the machine's place: the last minute."""
+COLOUR_GATE_PX = 5.0
+"""Median error with which a board in the colour image may place the machine first."""
 
 
 class Engine:
@@ -70,6 +77,9 @@ class Engine:
         self._distances_open = list(rig.distances)
         self._waiting: list[Bundle] = []
         self._forced = False
+        self._colour: list[list[MarkerSighting]] = []
+        """What the machine's colour camera saw of boards while it had no place."""
+        self._mounted = False
         self._pending = Update()
         self.open_picks: list[tuple[Pick, tuple[float, float] | None]] = []
         """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
@@ -87,6 +97,10 @@ class Engine:
             self._follow(bundle.frame)
         if self._wants_keyframe(bundle):
             self._insert_keyframe(bundle)
+        machine = [s for s in bundle.sightings if s.camera == "b_rgb"]
+        if machine:
+            self._colour = [*self._colour, machine][-COLOUR_VIEWS:]
+        self._see_from_machine()
         if bundle.cloud is not None:
             self.surfaces.see(bundle.cloud)
         if not self._waits(bundle):
@@ -152,7 +166,7 @@ class Engine:
         self.odometry.follow(frame)
 
     def _wants_keyframe(self, bundle: Bundle) -> bool:
-        mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
+        mobile = _mobile(bundle)
         if bundle.frame is None:
             return bool(mobile)
         first = not self.odometry.keyframe_stamps
@@ -180,9 +194,14 @@ class Engine:
             self._lay_landmarks(index)
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
-        mobile = [s for s in bundle.sightings if s.camera != "b_rgb"]
-        if mobile:
-            self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced))
+        mobile = _mobile(bundle)
+        if not mobile:
+            return
+        joint = None
+        if bundle.frame is not None and self.boards.displaced(self._camera_poses(key), mobile):
+            self.flush()
+            joint = self.solver.joint_covariance
+        self._take(self.boards.add(key, self._camera_poses(key), mobile, self._forced, joint))
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
         o_T_m = self.state.pose(key)
@@ -195,7 +214,7 @@ class Engine:
         """A keyframe without tracks stands where the known boards put it; else it waits for one of them."""
         index = len(self.odometry.keyframe_stamps)
         if index == 0:
-            found = gtsam.Pose3() if self._forced or self.boards.can_start(bundle.sightings) else None
+            found = gtsam.Pose3() if self._forced or self.boards.can_start(_mobile(bundle)) else None
         else:
             found = place(self.boards, self.state, bundle.sightings, self._nearest(bundle.stamp_ns))
         if found is None:
@@ -233,12 +252,13 @@ class Engine:
                     self.flush()
             if len(self._waiting) == before:
                 break
+        self._see_from_machine()
         self._retry_picks()
         self.flush()
 
     def _start_from_best(self) -> None:
         """No frame is free of doubt: the one with the least begins."""
-        best = max(self._waiting, key=lambda b: max((self.boards.margin([s]) for s in b.sightings), default=-1.0))
+        best = max(self._waiting, key=lambda b: self.boards.margin(_mobile(b)))
         self._waiting.remove(best)
         self._forced = True
         self._insert_keyframe(best)
@@ -255,15 +275,47 @@ class Engine:
         """{b} enters through the mount when its board is known."""
         mount = self.rig.mount
         base = keys.base(0)
-        if mount is None or self.state.has(base) or not self.boards.known(mount.board):
+        if mount is None or self._mounted or not self.boards.known(mount.board):
             return
+        self._mounted = True
         board = self.boards.key(mount.board)
         update = Update()
-        update.guess(base, self.state.pose(board).compose(mount_pose(mount)))
+        if not self.state.has(base):
+            update.guess(base, self.state.pose(board).compose(mount_pose(mount)))
         what = f"f_T_b of board {mount.board}"
         update.add(mount_factor(mount, board, base), Record("mount", "mount", stamp_ns, what, rejectable=False))
         self._take(update)
         self._retry_picks()
+
+    def _see_from_machine(self) -> None:
+        """Boards in the machine's colour images tie {b} to them directly, and may give it its first place."""
+        base, extrinsics = keys.base(0), keys.extrinsics("b_rgb")
+        if not self._colour or not (self.state.has(base) or self._base_by_view()):
+            return
+        waiting, self._colour = self._colour, []
+        for seen in waiting:
+            poses = {"b_rgb": self.state.pose(base).compose(self.state.pose(extrinsics))}
+            joint = None
+            if self.boards.displaced(poses, seen):
+                self.flush()
+                poses = {"b_rgb": self.state.pose(base).compose(self.state.pose(extrinsics))}
+                joint = self.solver.joint_covariance
+            self._take(self.boards.add(base, poses, seen, False, joint))
+        self._retry_picks()
+
+    def _base_by_view(self) -> bool:
+        """{b} from a colour image of a board that the mobile camera has placed; the corners then hold it."""
+        for seen in reversed(self._colour):
+            points, px = self.boards.known_corners(seen)
+            found = camera_pose(points, px, self.state.intrinsics(keys.intrinsics("b_rgb")).K())
+            if found is None or found[1] > COLOUR_GATE_PX:
+                continue
+            update = Update()
+            b_T_rgb = self.state.pose(keys.extrinsics("b_rgb"))
+            update.guess(keys.base(0), pose3(found[0]).compose(b_T_rgb.inverse()))
+            self._take(update)
+            return True
+        return False
 
     def _close_distances(self, stamp_ns: int) -> None:
         """Known distances enter when both of their points are in the graph."""
@@ -380,3 +432,8 @@ def distance_name(distance: Distance) -> str:
 
 def _prior(name: str, stamp_ns: int) -> Record:
     return Record("calibration priors", name, stamp_ns, f"prior of {name}", rejectable=False)
+
+
+def _mobile(bundle: Bundle) -> list[MarkerSighting]:
+    """What the mobile cameras saw of boards."""
+    return [s for s in bundle.sightings if s.camera != "b_rgb"]

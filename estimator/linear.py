@@ -1,6 +1,7 @@
 """The linearised problem as one sparse system: covariances of anything, and what each factor contributes."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import gtsam
@@ -24,6 +25,30 @@ def deviate(total: float, dof: int) -> float:
     """Chi-square in words of sigmas of one normal variable, two-sided."""
     tail = float(chi2.sf(total, dof))
     return float(np.sqrt(total)) if tail < 1e-300 else float(norm.isf(tail / 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """k errors of the measurements, the other n unknowns eliminated (Baarda 1968)."""
+
+    information: Float
+    """Shape (k, k)."""
+    alone: Float
+    """Shape (k,): the diagonal of the information, were the other unknowns known."""
+    right: Float
+    """Shape (k,): information times estimate."""
+    response: Float
+    """Shape (n, k): the other unknowns change by `response @ y`."""
+
+    def determined(self) -> bool:
+        """Can the data tell these errors from the unknowns?"""
+        least = float(np.linalg.eigvalsh(self.information / np.sqrt(np.outer(self.alone, self.alone)))[0])
+        return bool((self.alone > 0).all()) and least > DETERMINED
+
+    def solution(self) -> tuple[Float, Float]:
+        """Estimate (k,) and covariance (k, k)."""
+        covariance = np.linalg.inv(self.information)
+        return np.asarray(covariance @ self.right, float), np.asarray(covariance, float)
 
 
 class LinearSystem:
@@ -134,6 +159,17 @@ class LinearSystem:
             along = (vectors.T @ self.b[self.starts[position] : self.starts[position + 1]])[free]
             found.append((float((along**2 / eigenvalues[free]).sum()), int(free.sum())))
         return found
+
+    def shift(self, C: csr_matrix) -> Shift:
+        """Errors of the measurements as further unknowns y: `b = A x + C y`.
+
+        Args:
+            C: shape (rows, k), whitened.
+        """
+        AC = np.asarray((self.A.T @ C).todense())
+        response = -self.solve(AC)
+        full = np.asarray((C.T @ C).todense())
+        return Shift(full + AC.T @ response, full.diagonal(), np.asarray(C.T @ self.b), response)
 
     def leverage(self, group: NDArray[np.int64], groups: int, probes: int = 64, seed: int = 0) -> Float:
         """Number of parameters that each group of factors determines (trace of its part of the hat matrix).

@@ -29,7 +29,9 @@ Float = NDArray[np.float64]
 
 KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
-OUTLINE_SPACING_M = 0.12
+OUTLINE_VIEWS = 16
+"""Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
+OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
 OUTLINE_PRIOR = (0.006, 0.02, 0.008)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
@@ -66,7 +68,7 @@ class Pipeline:
         self._kept_bytes = 0
         self._looked: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
-        self._last_colour_ns = 0
+        self._last_colour_ns: int | None = None
         self._colour: ImageBody | None = None
         """The Kinect's newest colour image, not decoded."""
 
@@ -135,9 +137,18 @@ class Pipeline:
             camera = self._camera_of(item.topic)
             if isinstance(item.body, DetectionsBody) and camera is not None:
                 found += self.sensors.detections(camera, stamp_ns, item.body)
+            if isinstance(item.body, ImageBody) and camera == "b_rgb" and self._colour_due(stamp_ns):
+                found += self.sensors.markers("b_rgb", stamp_ns, item.body.pixels())
         if {"m_left", "m_right"} <= {s.camera for s in found}:
             self._sides.look(found, self.sensors.cameras, self.sensors.left_T_right())
         return found
+
+    def _colour_due(self, stamp_ns: int) -> bool:
+        """Is it time to look for boards in the machine's colour image?"""
+        due = self._last_colour_ns is None or stamp_ns - self._last_colour_ns >= COLOUR_PERIOD_NS
+        if due:
+            self._last_colour_ns = stamp_ns
+        return due
 
     def _camera_of(self, topic: str) -> str | None:
         for name in ("m_left", "m_right", "b_rgb"):
@@ -254,7 +265,7 @@ class Pipeline:
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
         axis = self.engine.pipes.axis(pipe)
         where = self.engine.seen_from(camera, pair.stamp_ns)
-        if axis is None or where is None:
+        if axis is None or where is None or len(looked) >= OUTLINE_VIEWS:
             return
         place = where.o_T_c.translation()
         if any(np.linalg.norm(place - other) < OUTLINE_SPACING_M for other in looked.values()):

@@ -53,9 +53,10 @@ def _views(
     """Camera, sightings of known boards, their corners in {o}; the camera that sees most first."""
     views = []
     for camera in ("m_left", "m_right"):
-        seen = [s for s in sightings if s.camera == camera and boards.known(s.board)]
+        mine = [s for s in sightings if s.camera == camera]
+        seen = boards.usable(mine)
         if seen and state.has(keys.intrinsics(camera)):
-            views.append((camera, seen, *boards.known_corners(seen)))
+            views.append((camera, seen, *boards.known_corners(mine)))
     return sorted(views, key=lambda view: -len(view[1]))
 
 

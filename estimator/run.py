@@ -7,6 +7,7 @@ from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, Rejection
 from ..factors.rig import Rig
 from .batch import solve
+from .board_faults import settle_boards
 from .bundle import bundles
 from .engine import Engine
 from .result import Result
@@ -38,6 +39,8 @@ def finish(
         )
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    solution = settle_boards(engine, solution)
+    engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events
     return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))

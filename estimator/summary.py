@@ -18,10 +18,8 @@ from .advice import advise
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
-from .correlation import track_inflation
+from .correlation import Active, inflated_system
 from .engine import Engine, distance_name
-from .graph import Record
-from .linear import LinearSystem
 from .marker_points import parse_point
 from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
@@ -40,7 +38,6 @@ from .surroundings import Surroundings, compact_map, nearest_surface, surroundin
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
 """Names of the intrinsics' components; the skew is not reported."""
-Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 
 
 class Summary:
@@ -52,14 +49,7 @@ class Summary:
         self._solution = solution
         off = set(solution.outliers)
         self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        graph = gtsam.NonlinearFactorGraph()
-        for _, factor, _ in self._active:
-            graph.add(factor)
-        self._system = LinearSystem(graph, solution.values)
-        records = [record for _, _, record in self._active]
-        self._inflation = track_inflation(records, self._system, ODOMETRY)
-        of_tracks = np.array([r.family == ODOMETRY for r in records])
-        self._system.inflation[np.repeat(of_tracks, self._system.rows)] = self._inflation
+        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -250,6 +240,7 @@ class Summary:
                         f"{board.id}.print_scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
                     )
                 )
+        rows += engine.boards.insets
         return tuple(rows)
 
     def _extrinsic_rows(self) -> list[CalibrationEstimate]:

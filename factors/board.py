@@ -21,6 +21,9 @@ DIRECTIONS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1
 CORNER_PRINT_SIGMA_M = 5e-5
 """Raggedness of one printed corner: about one dot of a 600 dpi print."""
 
+LOOSE_SIGMAS = np.array([0.1, 0.1, 0.5])
+"""Sigmas of shift (m) and turn (rad) of a marker that has come off."""
+
 
 def marker_rotation(marker: Marker) -> Float:
     """The marker's axes in the page, shape (3, 3)."""
@@ -35,7 +38,13 @@ def page_corners(marker: Marker, side_m: float, scale: float = 1.0) -> Float:
 
 
 def page_factor(
-    board: Board, marker: Marker, board_key: int, page_key: int, slot: int, detection_m: float = 0.0
+    board: Board,
+    marker: Marker,
+    board_key: int,
+    page_key: int,
+    slot: int,
+    detection_m: float = 0.0,
+    loose: bool = False,
 ) -> gtsam.CustomFactor:
     """Four corners of a marker lie on the page: `f_q = scale * centre + side / 2 * direction`.
 
@@ -44,11 +53,16 @@ def page_factor(
 
     Args:
         detection_m: the part of a corner's detection error that stays the same in all views, on the page.
+        loose: the marker is a square of its own: anywhere near its place, and turned as it likes.
     """
     centre = np.array([marker.centre_m[0], marker.centre_m[1], 0.0])
     half = 0.5 * DIRECTIONS @ marker_rotation(marker).T
     page_jacobian = np.stack([-half.ravel(), np.tile(-centre, 4)], axis=1)
     common = np.kron(np.ones((4, 4)), np.eye(3)) * board.centre_sigma_m**2
+    if loose:
+        common = (
+            shift_directions(marker, board.side_m) @ np.diag(LOOSE_SIGMAS**2) @ shift_directions(marker, board.side_m).T
+        )
     noise = gaussian(common + np.eye(12) * (CORNER_PRINT_SIGMA_M**2 + detection_m**2))
     variables = [board_key, page_key, *(keys.corner(slot, i) for i in range(4))]
 
@@ -74,24 +88,34 @@ def page_factor(
     return gtsam.CustomFactor(noise, variables, error)
 
 
-def side_prior(page_key: int, board: Board, side_m: float, sigma_m: float) -> gtsam.CustomFactor:
-    """The rig's side length, with its tolerance."""
-    return _page_prior(page_key, 0, side_m, sigma_m)
+def shift_directions(marker: Marker, side_m: float) -> Float:
+    """How a page factor's residual changes with a marker's own shift in x and y (m) and turn (rad): shape (12, 3)."""
+    half = 0.5 * side_m * DIRECTIONS @ marker_rotation(marker).T
+    turned = np.stack([-half[:, 1], half[:, 0], np.zeros(4)], axis=1)
+    return np.stack([np.tile([1.0, 0.0, 0.0], 4), np.tile([0.0, 1.0, 0.0], 4), turned.ravel()], axis=1)
 
 
-def print_scale_prior(page_key: int, board: Board) -> gtsam.CustomFactor:
-    """All distances of one page share the printer's scale error: what they know together is the scale."""
-    return _page_prior(page_key, 1, 1.0, board.print_scale_sigma)
-
-
-def _page_prior(page_key: int, index: int, mean: float, sigma: float) -> gtsam.CustomFactor:
-    row = np.zeros((1, 2))
-    row[0, index] = 1.0
+def side_prior(page_key: int, side_m: float, sigma_m: float) -> gtsam.CustomFactor:
+    """The rig's side length, with its tolerance. A page printed small has small markers: `side = scale * side_m`."""
+    row = np.array([[1.0, -side_m]])
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         if jacobians is not None:
             jacobians[0] = row
-        return np.array([values.atVector(page_key)[index] - mean])
+        side, scale = values.atVector(page_key)
+        return np.array([side - scale * side_m])
+
+    return gtsam.CustomFactor(sigmas([sigma_m]), [page_key], error)
+
+
+def print_scale_prior(page_key: int, sigma: float) -> gtsam.CustomFactor:
+    """All distances of one page share the printer's scale error: what they know together is the scale."""
+    row = np.array([[0.0, 1.0]])
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
+        if jacobians is not None:
+            jacobians[0] = row
+        return np.array([values.atVector(page_key)[1] - 1.0])
 
     return gtsam.CustomFactor(sigmas([sigma]), [page_key], error)
 

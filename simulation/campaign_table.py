@@ -73,7 +73,7 @@ def tabulate(rows: Sequence[Row]) -> CampaignTable:
     return CampaignTable(
         runs=len(rows),
         failed=len(rows) - len(good),
-        reasons=dict(Counter(row["reason"] for row in rows if row["status"] != "done").most_common(10)),
+        reasons=dict(Counter(row["reason"][:160] for row in rows if row["status"] != "done").most_common(10)),
         summaries=summarise([quantities_of(row) for row in good]),
         chain=errors_of(chain) if chain else None,
         consistent=passed / len(good) if good else float("nan"),

@@ -12,7 +12,8 @@ import numpy as np
 from ..estimator.baseline import ClickedPoint
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
-from ..factors.rig import Board, Distance, Marker, Mount, Pipe, Pose, Rig
+from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
+from .measurement_level_board import misprinted
 from .measurement_level_machine import clicks, cloud_frames, stereo_clicks
 from .measurement_level_mobile import marker_sightings, stereo_frames
 from .measurement_level_scenario import Scenario
@@ -68,7 +69,14 @@ def base_rig(scenario: Scenario, side: float, radius_m: float) -> Rig:
     """The rig file of a run: an A4 board with four 75 mm markers beside the Kinect, and the scenario's own keys."""
     marker_places = ((-0.05, 0.09), (0.05, 0.09), (-0.05, -0.09), (0.05, -0.09))
     board = Board(id="f0", markers=tuple(Marker(id=i, centre_m=place) for i, place in enumerate(marker_places)))
+    # The drawn lenses have no distortion, so there is none to be found.
+    cameras = Cameras()
+    undistorted = {
+        name: getattr(cameras, name).model_copy(update={"freeze": ("distortion",)})
+        for name in ("m_left", "m_right", "b_rgb")
+    }
     rig = Rig(
+        cameras=cameras.model_copy(update=undistorted),
         boards=(board,),
         mount=Mount(
             board="f0",
@@ -91,6 +99,8 @@ def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
         if scenario.faults
         else nominal_rig(rig, nominal, scenario.baseline_m)
     )
+    first = rig.boards[0].id
+    true.boards[first] = misprinted(true.boards[first], scenario.board)
     w_T_f = {rig.boards[0].id: scene.w_T_b @ invert(true.f_T_b)}
     stamps_s, w_T_m, places_s = mobile_path(scene, w_T_f[rig.boards[0].id][:3, 3], scenario.motion, rng)
     stamps_ns = tuple(START_NS + round(1e9 * float(t)) for t in stamps_s)

@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.measurements import MarkerSighting, StereoFrame
+from .measurement_level_board import corners_on_page, inwards, knocked
+from .measurement_level_scenario import BoardFaults
 from .measurement_level_scene import occluded
 from .measurement_level_truth import Float, TrueCamera, invert, matrix, transform
 from .measurement_level_world import World, inside, project, spoil
@@ -103,15 +105,19 @@ def marker_sightings(world: World) -> list[MarkerSighting]:
         common = {}
         for stamp_ns, w_T_m in zip(world.stamps_ns, world.w_T_m, strict=True):
             for page in world.true.boards.values():
-                corners = transform(world.w_T_f[page.id], page.corners_m)
-                for marker, corners_w in zip(page.markers, corners, strict=True):
+                faults = world.scenario.board if page.id == world.rig.boards[0].id else BoardFaults()
+                seconds = 1e-9 * (stamp_ns - world.stamps_ns[0])
+                w_T_f = knocked(world.w_T_f[page.id], faults, seconds)
+                for marker, corners_f in corners_on_page(page, faults, seconds).items():
+                    corners_w = transform(w_T_f, corners_f)
                     exact_px = _whole_marker(world, world.true.cameras[name], w_T_m @ m_T_camera, corners_w)
                     if exact_px is None:
                         continue
                     place = (page.id, marker, *np.floor(w_T_m[:3, 3] / PLACE_M))
                     if place not in common:
                         common[place] = world.rng.normal(0.0, world.rig.noise.marker_common_px, (4, 2))
-                    sightings.append(_sighting(world, stamp_ns, name, page.id, marker, exact_px + common[place]))
+                    found_px = inwards(exact_px, faults.inset_px) + common[place]
+                    sightings.append(_sighting(world, stamp_ns, name, page.id, marker, found_px))
     return sightings
 
 

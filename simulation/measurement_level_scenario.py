@@ -87,6 +87,24 @@ class Picks(Section):
     outline_sigma_px: Positive = 0.3
 
 
+class BoardFaults(Section):
+    """What is wrong with the first board, and not in the rig file."""
+
+    page_scale: Positive = 1.0
+    swapped: tuple[int, int] | None = None
+    """Two ids that stand in each other's place."""
+    loose: int | None = None
+    loose_at_s: NonNegative = 0.0
+    loose_shift_m: tuple[float, float] = (0.006, -0.004)
+    loose_turn_rad: float = 0.05
+    knock_at_s: NonNegative | None = None
+    knock_shift_m: tuple[float, float, float] = (0.02, 0.0, 0.01)
+    """In {f}."""
+    knock_turn_rad: tuple[float, float, float] = (0.0, 0.06, 0.0)
+    inset_px: float = 0.0
+    """All corners found so far inside their markers, along the diagonal."""
+
+
 class Scenario(Section):
     """One kind of run. Every run draws scene, faults of the rig, motion and noise anew from its seed."""
 
@@ -107,6 +125,7 @@ class Scenario(Section):
     picks: Picks = Picks()
     noise_factors: NoiseFactors = NoiseFactors()
     outliers: Outliers = Outliers()
+    board: BoardFaults = BoardFaults()
     faults: bool = True
     """False: the rig is in truth exactly as its file says."""
     typed_side_m: Positive | None = None

@@ -12,6 +12,9 @@ from ..factors.rig import Board, Pose, Rig
 
 Float = NDArray[np.float64]
 
+START_DISTANCE_M = 1.15
+"""Of the mobile camera from the board when it first sees it."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrueCamera:
@@ -106,8 +109,13 @@ def draw_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float, rng: n
         f_T_b=f_T_b,
         depth_offset_m=float(rng.normal(0.0, kinect.depth_offset_sigma_m)),
         depth_scale=float(rng.normal(0.0, kinect.depth_scale_sigma)),
-        boards={board.id: draw_board(board, rng) for board in rig.boards},
+        boards={board.id: draw_board(board, rng, _lasting_m(rig, cameras)) for board in rig.boards},
     )
+
+
+def _lasting_m(rig: Rig, cameras: dict[str, TrueCamera]) -> float:
+    """The part of a corner's detection error that stays in all views, on the page: as the page factor has it."""
+    return rig.noise.marker_common_px * START_DISTANCE_M / float(cameras["m_left"].K[0, 0])
 
 
 def nominal_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float) -> TrueRig:
@@ -125,17 +133,17 @@ def nominal_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float) -> 
     )
 
 
-def draw_board(board: Board, rng: np.random.Generator | None) -> TrueBoard:
+def draw_board(board: Board, rng: np.random.Generator | None, lasting_m: float = 0.0) -> TrueBoard:
     """A page with its print errors: common scale, single centres, apparent side. Without `rng`: as described."""
     n = len(board.markers)
     print_scale = 1.0 + (0.0 if rng is None else float(rng.normal(0.0, board.print_scale_sigma)))
-    side_m = board.side_m + (0.0 if rng is None else float(rng.normal(0.0, board.side_sigma_m)))
+    side_m = print_scale * board.side_m + (0.0 if rng is None else float(rng.normal(0.0, board.side_sigma_m)))
     centres_m = np.zeros((n, 3))
     centres_m[:, :2] = print_scale * np.array([marker.centre_m for marker in board.markers])
     ragged_m = np.zeros((n, 4, 3))
     if rng is not None:
         centres_m += rng.normal(0.0, board.centre_sigma_m, (n, 3))
-        ragged_m = rng.normal(0.0, CORNER_PRINT_SIGMA_M, (n, 4, 3))
+        ragged_m = rng.normal(0.0, np.hypot(CORNER_PRINT_SIGMA_M, lasting_m), (n, 4, 3))
     squares_m = np.array([0.5 * side_m * DIRECTIONS @ marker_rotation(marker).T for marker in board.markers])
     corners_m = centres_m[:, None] + squares_m + ragged_m
     return TrueBoard(

@@ -22,8 +22,8 @@ from surecut.simulation.measurement_level_scenario import Scenario
 SHORT = Scenario.model_validate(
     {
         "name": "short",
-        "motion": {"duration_s": 12.0, "keyframe_rate_hz": 2.0},
-        "tracks": {"per_frame": 40},
+        "motion": {"duration_s": 16.0, "keyframe_rate_hz": 3.0},
+        "tracks": {"per_frame": 50},
         "clouds": {"frames": 0},
     }
 )

@@ -85,12 +85,11 @@ def test_page_factor_is_zero_on_the_page():
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_page_priors(index):
-    sheet = Board(id="f0", markers=(Marker(id=0, centre_m=(0, 0)),))
     values = gtsam.Values()
     values.insert(keys.page(0), np.array([0.07, 0.97]))
     make = [
-        lambda: board.side_prior(keys.page(0), sheet, 0.075, 0.001),
-        lambda: board.print_scale_prior(keys.page(0), sheet),
+        lambda: board.side_prior(keys.page(0), 0.075, 0.001),
+        lambda: board.print_scale_prior(keys.page(0), 0.005),
     ]
     factor = make[index]()
     check(factor, values, whitener(factor.noiseModel()))

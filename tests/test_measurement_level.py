@@ -41,7 +41,7 @@ SCENARIO = Scenario.model_validate({"rig": {"noise": {"marker_common_px": 0.0}}}
 
 @pytest.fixture(scope="module")
 def runs():
-    return [draw(SCENARIO, seed) for seed in range(4)]
+    return [draw(SCENARIO, seed) for seed in range(2)]
 
 
 def test_same_seed_same_run():
@@ -63,14 +63,14 @@ def test_marker_corners(runs):
                 c_T_o = invert(run.truth.rig.m_left_T_m_right) @ c_T_o
             exact = project(run.truth.rig.cameras[sighting.camera], c_T_o, corners_o)
             values.append(whitened(sighting.corners_px - exact, sighting.covariance_px2))
-    assert sum(map(len, values)) > 2000
+    assert sum(map(len, values)) > 1000
     assert_normal(np.concatenate(values))
 
 
 def test_tracks_triangulate_to_one_point_with_the_stated_noise(runs):
     """Each track, with true poses and calibration: the residuals of the best point are chi-square."""
     squares, dofs = 0.0, 0
-    for run in runs[:2]:
+    for run in runs[:1]:
         left, right = run.truth.rig.cameras["m_left"], run.truth.rig.cameras["m_right"]
         rows: dict[int, list] = {}
         for frame in of(run, StereoFrame):
@@ -84,7 +84,7 @@ def test_tracks_triangulate_to_one_point_with_the_stated_noise(runs):
             if len(views) >= 4:
                 square, dof = triangulation_residual(views, SCENARIO.tracks.sigma_px)
                 squares, dofs = squares + square, dofs + dof
-    assert dofs > 3000
+    assert dofs > 1500
     assert squares / dofs == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / dofs))
 
 
@@ -134,7 +134,7 @@ def test_cloud_points_lie_on_their_surface_once_the_depth_is_corrected(runs):
 
 def test_picks_and_outlines(runs):
     clicks, edges = [], []
-    for seed in range(4, 14):
+    for seed in range(4, 8):
         run = draw(SCENARIO, seed)
         truth, camera = run.truth, run.truth.rig.cameras["m_left"]
         for pick in of(run, Pick):
@@ -202,7 +202,7 @@ def test_outliers_have_the_asked_share():
 
 def test_calibration_is_drawn_from_its_prior():
     baselines, focal, scales, radii = [], [], [], []
-    for seed in range(60):
+    for seed in range(25):
         run = draw(Scenario.model_validate({"motion": {"duration_s": 1.0}, "clouds": {"frames": 0}}), seed)
         rig = run.truth.rig
         baselines.append((np.linalg.norm(rig.m_left_T_m_right[:3, 3]) / 0.15 - 1.0) / run.rig.stereo.baseline_sigma_rel)

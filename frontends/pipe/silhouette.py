@@ -28,6 +28,8 @@ class OutlineConfig:
     click_sigma_px: float = 1.5
     limits: PairLimits = field(default_factory=PairLimits)
     refined_pairs: int = 7
+    refined_known: int = 3
+    """Of these where width and place are known beforehand."""
     """Hypotheses that get the sub-pixel fit."""
     lowest_quality: float = 0.8
     largest_sigma_px: float = 0.5
@@ -144,7 +146,8 @@ class OutlineFinder:
         values, px = grey.ravel(), ideal.reshape(-1, 2)
         fits: dict[tuple[int, bool], EdgeFit | None] = {}
         found = []
-        for pair in pairs[: self._config.refined_pairs]:
+        known = prior.half_width_px is not None
+        for pair in pairs[: self._config.refined_known if known else self._config.refined_pairs]:
             both = []
             for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
                 foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
