@@ -65,7 +65,7 @@ def draw_plan(axes: plt.Axes, result: Result) -> None:
     axes.set_ylabel("z, m")
     axes.set_aspect("equal")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.02, 1.0))
 
 
 if __name__ == "__main__":

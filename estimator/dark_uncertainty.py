@@ -62,11 +62,12 @@ def of_distances(system: LinearSystem, positions: Sequence[int], sigmas: Float) 
     return missing_variance(errors, variances) if len(errors) >= ENOUGH else 0.0
 
 
-def event(tau2: float, count: int, stamp_ns: int) -> Event:
-    """What the user has to know about it."""
+def event(tau2: float, sigmas: Float, stamp_ns: int) -> Event:
+    """What the user has to know about it; a warning where it is more than the given sigmas."""
     tau_mm = 1e3 * float(np.sqrt(tau2))
     text = (
-        f"the {count} given distances disagree with each other by {tau_mm:.1f} mm more than their sigmas say; this is "
-        "added to the sigma of every distance"
+        f"the {len(sigmas)} given distances disagree with each other by {tau_mm:.1f} mm more than their sigmas say; "
+        "this is added to the sigma of every distance"
     )
-    return Event(stamp_ns, "dark_uncertainty", text, "warning", {"tau_mm": tau_mm})
+    severity = "warning" if tau2 > float(np.median(sigmas)) ** 2 else "info"
+    return Event(stamp_ns, "dark_uncertainty", text, severity, {"tau_mm": tau_mm})

@@ -302,9 +302,10 @@ class Summary:
         """Variance that the given distances show beyond the model; tells the user."""
         sigmas = {distance_name(d): d.sigma_m for d in self._engine.rig.distances}
         rows = [(i, sigmas[r.what]) for i, (_, _, r) in enumerate(self._active) if r.what in sigmas]
-        variance = dark_uncertainty.of_distances(self._system, [i for i, _ in rows], np.array([s for _, s in rows]))
+        given = np.array([s for _, s in rows])
+        variance = dark_uncertainty.of_distances(self._system, [i for i, _ in rows], given)
         if variance > 0.0:
-            self._engine.events.append(dark_uncertainty.event(variance, len(rows), self._engine.end_ns))
+            self._engine.events.append(dark_uncertainty.event(variance, given, self._engine.end_ns))
         return variance
 
     def _distance(self, a: str, b: str) -> tuple[float, float] | None:
