@@ -30,6 +30,8 @@ VIEWS_TO_EXCHANGE = 2
 VIEWS_TO_RELEASE = 3
 """Images of different moments in a row that have to agree that a marker is off its place."""
 DOUBLED = "stands in the image more than once"
+SAME_PX = 1.0
+"""Two sightings of an id that are nearer to each other than this are one."""
 MEMORY = 25
 """Fits of accepted images by which a new one is judged: lens and print are never as perfect as the corners."""
 
@@ -88,6 +90,7 @@ class Inspection:
 
     def _once_each(self, sheet: Sheet, seen: list[MarkerSighting]) -> list[MarkerSighting]:
         """Of an id that stands in an image twice the one that fits the rest of the board, or none."""
+        seen = _distinct(seen)
         counts = Counter(s.marker for s in seen)
         double = sorted(m for m, n in counts.items() if n > 1)
         if not double:
@@ -149,7 +152,8 @@ class Inspection:
             self._clear(sheet, seen)
             return seen
         board, common = sheet.board, self._rig.noise.marker_common_px
-        found = suspicious_markers(seen, board, self._pinhole(seen[0].camera), self._side(sheet), common)
+        side = self._side(sheet) if sheet.page_known else self._side_without_one(sheet, seen)
+        found = suspicious_markers(seen, board, self._pinhole(seen[0].camera), side, common)
         if not found:
             if fit is not None:
                 self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
@@ -169,6 +173,16 @@ class Inspection:
         corners = board_corners(seen, board, common)
         fit = fit_board(corners, camera, starts[0].camera_T_f, side, side_free=True)
         return (fit.chi2, fit.dof) if np.isfinite(fit.chi2) else None
+
+    def _side_without_one(self, sheet: Sheet, seen: list[MarkerSighting]) -> float:
+        """Side length of a page that holds together once one marker is left out; the rig's where none does."""
+        for k in range(len(seen)):
+            rest = seen[:k] + seen[k + 1 :]
+            fit = self._fit(sheet, rest) if len({s.marker for s in rest}) > 1 else None
+            if fit is not None and fit[0] < chi2.isf(FALSE_ALARM, fit[1]):
+                camera, common = self._pinhole(rest[0].camera), self._rig.noise.marker_common_px
+                return apparent_side(rest, sheet.board, camera, common)[0]
+        return sheet.board.side_m
 
     def _side(self, sheet: Sheet) -> float:
         """Side length over print scale, as the rig or the estimate has it: an image does not know the scale."""
@@ -251,3 +265,13 @@ class Inspection:
         named = {"marker": float(marker), **values}
         event = Event(stamp_ns, kind, text, severity, named)  # type: ignore[arg-type]
         self.events.setdefault((kind, board, marker), event)
+
+
+def _distinct(seen: list[MarkerSighting]) -> list[MarkerSighting]:
+    """One of several sightings at one place: an image that was recorded twice."""
+    kept: list[MarkerSighting] = []
+    for s in seen:
+        same = (k for k in kept if k.marker == s.marker)
+        if all(float(np.abs(k.corners_px - s.corners_px).max()) > SAME_PX for k in same):
+            kept.append(s)
+    return kept

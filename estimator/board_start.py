@@ -81,7 +81,7 @@ class FirstPose:
             return -1.0
         if len(found) > 1:
             return found[1].chi2 - found[0].chi2
-        return 0.0 if _frontal(found[0]) else float("inf")
+        return 0.0 if _frontal(found[0], seen) else float("inf")
 
     def side(self, sheet: Sheet, seen: Sequence[MarkerSighting]) -> Side:
         """The side length that views of one moment show: by the places of several markers, else by stereo."""
@@ -137,13 +137,16 @@ class FirstPose:
         if several and not force and len({s.marker for s in seen}) < 2 and len(sheet.held) < SINGLE_VIEWS:
             return None
         side = self.side(sheet, seen)
-        camera = _of_best_camera(seen)[0].camera
-        found = self._candidates(sheet, seen, side)
+        # the camera that sees most of it, unless another one alone rules out the second pose
+        by_camera = [[s for s in seen if s.camera == c] for c in dict.fromkeys(s.camera for s in seen)]
+        ranked = sorted(by_camera, key=lambda mine: (-self.margin(sheet, mine), -len(mine)))
+        camera = ranked[0][0].camera
+        found = self._candidates(sheet, ranked[0], side)
         starts = [camera_poses[camera].compose(pose3(c.camera_T_f)) for c in found]
         if not starts:
             return None
         if len(starts) == 1:
-            sure = not _frontal(found[0])
+            sure = not _frontal(found[0], ranked[0])
             return Start(starts[0], side, sure) if sure or force else None
         views = [v for key, held in sheet.held for v in self._views(sheet, key, held, side.length_m)]
         fits = sorted((_refined(start, views) for start in starts), key=lambda fit: fit[0])
@@ -172,8 +175,10 @@ class FirstPose:
         return views
 
 
-def _frontal(pose: PoseCandidate) -> bool:
-    """The two poses of a plane have run together: its tilt is hardly known, and its sign not at all."""
+def _frontal(pose: PoseCandidate, seen: Sequence[MarkerSighting]) -> bool:
+    """The two poses of a lone marker have run together: its tilt is hardly known, and its sign not at all."""
+    if len({s.marker for s in seen}) > 1:
+        return False
     normal, place = pose.camera_T_f[:3, 2], pose.camera_T_f[:3, 3]
     tilt = float(np.arccos(np.clip(-(normal @ place) / np.linalg.norm(place), -1.0, 1.0)))
     sigma = float(np.sqrt(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1]))

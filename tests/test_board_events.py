@@ -65,6 +65,15 @@ def test_side_length_typed_wrong():
     assert_not_bent(run, result)
 
 
+def test_wrong_side_and_loose_marker_together():
+    run, result = run_of(1, typed_side_m=0.05, board={"loose": 1})
+    assert {e.kind for e in result.events} & BOARD_EVENTS == {"side_length_wrong", "marker_loose"}
+    (side,), (loose,) = told(result, "side_length_wrong"), told(result, "marker_loose")
+    assert abs(side.values["seen_m"] - run.truth.rig.boards["f0"].side_m) < 3 * side.values["sigma_m"]
+    assert loose.values["marker"] == 1.0
+    assert_not_bent(run, result)
+
+
 def test_side_length_of_a_single_marker_comes_from_stereo():
     rig = {"boards": [{"id": "f0", "markers": [{"id": 0, "centre_m": [0.0, 0.0]}]}]}
     run, result = run_of(1, typed_side_m=0.05, rig=rig)
