@@ -57,12 +57,14 @@ class ProcessExecutor:
 
     def run(self, task: Callable[[Item], Value], items: Sequence[Item]) -> Iterator[Outcome[Item, Value]]:
         waiting = deque((item, 1) for item in items)
-        while waiting:
-            # A process that dies breaks its whole pool; what was under way goes back, and a new pool goes on.
-            yield from self._run_pool(task, waiting)
+        suspects: deque[tuple[Item, int]] = deque()
+        while waiting or suspects:
+            # A process that dies breaks its whole pool. What was under way is tried again, each item alone, so that
+            # none is blamed for another's crash; a new pool goes on with the rest.
+            yield from self._run_pool(task, deque([suspects.popleft()]) if suspects else waiting, suspects)
 
     def _run_pool(
-        self, task: Callable[[Item], Value], waiting: deque[tuple[Item, int]]
+        self, task: Callable[[Item], Value], waiting: deque[tuple[Item, int]], suspects: deque[tuple[Item, int]]
     ) -> Iterator[Outcome[Item, Value]]:
         context = multiprocessing.get_context("spawn")
         with single_threaded_children(), ProcessPoolExecutor(self.jobs, mp_context=context) as pool:
@@ -70,15 +72,16 @@ class ProcessExecutor:
             try:
                 while waiting or running:
                     while waiting and len(running) < self.jobs:
-                        item, attempt = waiting.popleft()
-                        running[pool.submit(_attempt, task, item)] = (item, attempt)
+                        # taken out only once it is handed over: a pool that broke meanwhile refuses it
+                        running[pool.submit(_attempt, task, waiting[0][0])] = waiting[0]
+                        waiting.popleft()
                     done, _ = wait(running, return_when=FIRST_COMPLETED)
                     for future in done:
                         outcome = future.result()
                         running.pop(future)
                         yield outcome
             except BrokenProcessPool:
-                yield from _give_back(running, waiting)
+                yield from _give_back(running, suspects)
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
 

@@ -1,32 +1,12 @@
 """Serial, process pool and Dask give the same outcomes; failures and deaths are rows."""
 
 import os
-import signal
-import time
 
 import pytest
+from executor_tasks import square, square_or_die, threads
 
 from surecut.estimator.executor import DaskExecutor, ProcessExecutor, SerialExecutor, choose_executor
-from surecut.factors.errors import LogError, SurecutError
-
-
-def square(item):
-    if item == 3:
-        raise LogError("log.mcap: is empty")
-    if item == 4:
-        raise ValueError("two\nlines")
-    return item * item
-
-
-def square_or_die(item):
-    if item == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.05)
-    return item * item
-
-
-def threads(item):
-    return os.environ.get("OMP_NUM_THREADS")
+from surecut.factors.errors import SurecutError
 
 
 def as_rows(outcomes):
