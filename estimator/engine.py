@@ -24,13 +24,22 @@ from ..factors.calibration import (
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose
-from ..factors.measurements import Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import (
+    CylinderSighting,
+    Event,
+    MarkerSighting,
+    OutlineSighting,
+    Pick,
+    Rejection,
+    StereoFrame,
+)
 from ..factors.noise import sigmas
 from ..factors.rig import Distance, Rig
 from ..frontends.pick_image import CutOut
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .bundle import Bundle
+from .depth_pipes import DepthPipes
 from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
@@ -64,6 +73,7 @@ class Engine:
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
+        self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
@@ -383,6 +393,10 @@ class Engine:
         if where is not None:
             self._take(self.pipes.outline(outline, where))
 
+    def add_cylinder(self, pipe: str, base: int, found: CylinderSighting | Rejection) -> None:
+        """A pipe in the Kinect's cloud of a station, or why it was not found; enters with the next update."""
+        self._take(self.depth_pipes.add(found, pipe, base, self.solver))
+
     def lost_picks(self) -> list[Pick]:
         """Picks in cameras that have no place at their stamp."""
         return [*(p for p, _ in self.open_picks), *(p for b in self._waiting for p in b.picks)]
@@ -417,6 +431,7 @@ class Engine:
             *self.boards.held_back(),
             *self.pipes.rejected,
             *self.pipes.held_back(),
+            *self.depth_pipes.refused.values(),
             *self.surfaces.refused.values(),
             *waiting,
         ]

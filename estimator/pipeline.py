@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors import keys
 from ..factors.errors import LogError, ObservabilityError
 from ..factors.measurements import MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
@@ -164,10 +165,23 @@ class Pipeline:
             cloud = None
             if isinstance(item.body, DepthBody) and item.topic == self.rig.cameras.b_depth.image_topic:
                 cloud = self.sensors.depth(stamp_ns, item.body.depth_m())
-            if isinstance(item.body, CloudBody):
-                continue
+            if isinstance(item.body, CloudBody) and item.topic == self.rig.kinect.points_topic:
+                if self.sensors.kinect.cloud_due(stamp_ns):
+                    cloud = self.sensors.kinect.cloud(stamp_ns, item.body.points_m())
             if cloud is not None:
                 self.engine.add(Bundle(stamp_ns, cloud=cloud))
+                self._seek_cylinders()
+
+    def _seek_cylinders(self) -> None:
+        """Pipes that are known roughly, in the Kinect's newest cloud."""
+        base = keys.base(0)
+        for pipe in self.engine.depth_pipes.wanted(base):
+            predicted = self.engine.depth_pipes.predict(pipe, base, self.engine.solver)
+            if predicted is not None:
+                found = self.sensors.kinect.cylinder(pipe, predicted)
+                if found is not None:
+                    self.engine.add_cylinder(pipe, base, found)
+        self.engine.flush()
 
     def check(self) -> None:
         """After the last message: is there anything to estimate from, and was everything understood?
@@ -177,6 +191,7 @@ class Pipeline:
             ObservabilityError: a pick in a camera that nothing places.
         """
         self.engine.revisit()
+        self._seek_cylinders()
         self._check_ids()
         report = self.pairing
         if report.pairs == 0 and report.unpaired and not self.engine.odometry.keyframe_stamps:

@@ -15,6 +15,7 @@ from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
+from .agreement import cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
@@ -330,6 +331,9 @@ class Summary:
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
+        cylinders = cylinder_tests(engine.depth_pipes, self._active, self._system, self._values)
+        priors += cylinders
+        paths |= {t.record.what: t.sigma for t in cylinders}
         return judge(families, priors, paths)
 
     def _streaming_difference(self) -> dict[str, float]:

@@ -116,6 +116,8 @@ class CylinderSighting:
     inliers: int
     rms_m: float
     source: Literal["silhouette", "stereo_cloud", "kinect_cloud"]
+    by_depth: Float | None = None
+    """Shape (7, 2), d (point_a, point_b, radius) / d (depth offset [m], depth scale); None: no depth camera's."""
 
 
 @dataclass(frozen=True, slots=True)
