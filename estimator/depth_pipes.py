@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
+from ..factors.cloud import corrected, depth_moves
 from ..factors.measurements import CylinderSighting, Rejection
 from ..factors.noise import gaussian, robust
 from ..factors.pipe import cylinder_covariance, cylinder_factor
@@ -86,7 +87,7 @@ class DepthPipes:
             b_p = o_T_b.transformTo(start + place * direction)
             if b_p[2] < 0.2:
                 return None
-            ends.append(b_p - (offset + scale * b_p[2]) * b_p / b_p[2])
+            ends.append(corrected(b_p[None], -offset, -scale, -self._state.vector(keys.DEPTH_RAYS))[0])
         predicted = PredictedPipe(ends[0], ends[1], radius, 0.0)
         spread = self._spread(predicted, self._pipes.cylinders[pipe].index, base, solver)
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(spread[i : i + 2, i : i + 2])[-1] for i in (0, 2))))
@@ -94,9 +95,8 @@ class DepthPipes:
 
     def _spread(self, predicted: PredictedPipe, index: int, base: int, solver: Incremental) -> Float:
         """Covariance (5, 5) of what `cylinder_factor` compares, from the state alone."""
-        response = np.zeros((7, 2))
-        for rows, end in ((slice(0, 3), predicted.point_a_m), (slice(3, 6), predicted.point_b_m)):
-            response[rows, 0], response[rows, 1] = end / end[2], end
+        moves = depth_moves(np.stack([predicted.point_a_m, predicted.point_b_m]))
+        response = np.vstack([moves[0], moves[1], np.zeros((1, 5))])
         trial = CylinderSighting(
             0, "b_depth", "", predicted.point_a_m, predicted.point_b_m, predicted.radius_m, np.eye(7), 0, 0.0,
             "kinect_cloud", response,

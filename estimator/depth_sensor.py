@@ -7,6 +7,7 @@ from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, CylinderSighting, Rejection
 from ..factors.rig import Kinect
 from ..frontends.cloud.frontend import CloudFrontEnd, average_depth
+from ..frontends.cloud.noise import DepthModel
 from ..frontends.cloud.points import cloud_from_points
 from ..frontends.pipe.depth_cylinder import DepthImages, PredictedPipe, cylinder_near
 
@@ -22,7 +23,7 @@ class DepthSensor:
     """One depth camera. It delivers images, or clouds where no image has come."""
 
     def __init__(self, kinect: Kinect) -> None:
-        self._model = kinect.model
+        self._model: DepthModel = kinect.model
         self._clouds: CloudFrontEnd | None = None
         self._images: DepthImages | None = None
         self._waiting: list[tuple[int, Depth]] = []

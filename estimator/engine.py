@@ -15,6 +15,7 @@ from ..factors.board import distance_factor
 from ..factors.calibration import (
     cal3,
     depth_prior,
+    depth_ray_prior,
     intrinsics_prior,
     left_T_right,
     rgb_mean,
@@ -57,6 +58,8 @@ corners of all of them."""
 
 COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
+NOMINAL_DEPTH_FOCAL_PX = 580.0
+"""Of a Kinect v1, where clouds come without camera_info: turns the rig file's pixels into angles."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
 
@@ -152,6 +155,11 @@ class Engine:
             update = Update()
             update.guess(keys.DEPTH, np.zeros(2))
             update.add(depth_prior(self.rig.kinect), _prior("Kinect depth", bundle.stamp_ns))
+            camera = self.cameras.get("b_depth")
+            focal_px = NOMINAL_DEPTH_FOCAL_PX if camera is None else camera.fx
+            update.guess(keys.DEPTH_RAYS, np.zeros(3))
+            prior = depth_ray_prior(self.rig.cameras.b_depth, focal_px)
+            update.add(prior, _prior("rays of the depth camera", bundle.stamp_ns))
             self._take(update)
 
     def _open_camera(self, camera: str, stamp_ns: int) -> None:

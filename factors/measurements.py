@@ -117,7 +117,7 @@ class CylinderSighting:
     rms_m: float
     source: Literal["silhouette", "stereo_cloud", "kinect_cloud"]
     by_depth: Float | None = None
-    """Shape (7, 2), d (point_a, point_b, radius) / d (depth offset [m], depth scale); None: no depth camera's."""
+    """Shape (7, 5), d (point_a, point_b, radius) / d (depth states, `cloud.depth_moves`); None: no depth camera's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -160,7 +160,7 @@ def across_axis(direction: Float) -> Float:
     """Two unit directions across a third one, shape (2, 3)."""
     e1 = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
     e1 /= np.linalg.norm(e1)
-    return np.stack([e1, np.cross(direction, e1)])
+    return np.asarray(np.stack([e1, np.cross(direction, e1)]), np.float64)
 
 
 def cylinder_covariance(sighting: CylinderSighting) -> Float:
@@ -184,7 +184,7 @@ def cylinder_factor(sighting: CylinderSighting, noise: Model, pose: int, pipe: i
 
     The estimated axis passes the fitted one at the two fitted points: residual (5,) = offsets of the axis from
     point_a and from point_b in two directions across it, and the radius. Variables: the pose, the pipe, and with
-    `by_depth` the depth offset and scale, which the fit follows.
+    `by_depth` the depth camera's calibration, which the fit follows.
 
     Args:
         noise: of the residual, see `cylinder_covariance`.
@@ -193,11 +193,11 @@ def cylinder_factor(sighting: CylinderSighting, noise: Model, pose: int, pipe: i
     ends = (sighting.point_a_m, sighting.point_b_m)
     d_fit = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     E = across_axis(d_fit)
-    response = np.zeros((7, 2)) if sighting.by_depth is None else sighting.by_depth
+    response = np.zeros((7, 5)) if sighting.by_depth is None else sighting.by_depth
     by_depth = -_across_ends(sighting).T @ response
     variables = [pose, keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
     if sighting.by_depth is not None:
-        variables.append(keys.DEPTH)
+        variables += [keys.DEPTH, keys.DEPTH_RAYS]
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
@@ -211,15 +211,15 @@ def cylinder_factor(sighting: CylinderSighting, noise: Model, pose: int, pipe: i
             residual[rows] = E @ offset
             d_a[rows], d_b[rows] = E @ by_a, E @ by_b
         residual[4] = values.atVector(variables[3])[0] - sighting.radius_m
-        if len(variables) == 5:
-            residual += by_depth @ values.atVector(keys.DEPTH)
+        if len(variables) == 6:
+            residual += by_depth @ np.concatenate([values.atVector(keys.DEPTH), values.atVector(keys.DEPTH_RAYS)])
         if jacobians is not None:
             jacobians[0] = d_a @ Ja + d_b @ Jb
             jacobians[1] = d_a @ Ra
             jacobians[2] = d_b @ Rb
             jacobians[3] = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
-            if len(variables) == 5:
-                jacobians[4] = by_depth
+            if len(variables) == 6:
+                jacobians[4], jacobians[5] = by_depth[:, :2], by_depth[:, 2:]
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)

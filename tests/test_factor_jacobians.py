@@ -114,6 +114,7 @@ def test_plane_factor():
     values.insert(keys.base(0), a_pose())
     values.insert(keys.landmark(5), RNG.normal(0, 1, 3))
     values.insert(keys.DEPTH, np.array([0.01, -0.004]))
+    values.insert(keys.DEPTH_RAYS, np.array([0.002, -0.001, 0.003]))
     normal = np.array([0.3, -0.2, -0.93])
     normal /= np.linalg.norm(normal)
     factor = cloud.plane_factor(keys.base(0), keys.landmark(5), np.array([0.4, -0.3, 2.0]), normal, sigmas([0.01]))
@@ -163,6 +164,7 @@ def test_cylinder_factor():
     a_pipe(values)
     values.insert(keys.base(0), gtsam.Pose3.Expmap(RNG.normal(0, 0.1, 6)))
     values.insert(keys.DEPTH, np.array([0.01, -0.004]))
+    values.insert(keys.DEPTH_RAYS, np.array([0.002, -0.001, 0.003]))
     seen = cylinder_sighting()
     np.testing.assert_allclose(pipe.cylinder_covariance(seen), np.eye(5) * 1e-4, atol=1e-12)
     factor = pipe.cylinder_factor(seen, gaussian(pipe.cylinder_covariance(seen)), keys.base(0), 0)
@@ -174,14 +176,14 @@ def cylinder_sighting():
     axis = (b - a) / np.linalg.norm(b - a)
     across = np.kron(np.eye(2), np.eye(3) - np.outer(axis, axis))
     information = np.block([[across, np.zeros((6, 1))], [np.zeros((1, 6)), np.ones((1, 1))]]) / 1e-4
-    response = np.random.default_rng(4).normal(0, 1, (7, 2))
+    response = np.random.default_rng(4).normal(0, 1, (7, 5))
     return CylinderSighting(5, "b_depth", "pipe0", a, b, 0.05, information, 900, 0.001, "kinect_cloud", response)
 
 
 def test_a_cylinder_seen_too_far_by_the_depth_offset():
     # The true pipe is 20 mm nearer than the depth camera says: an offset of -20 mm explains the whole residual.
     a, b, r = np.array([0.0, -0.3, 1.5]), np.array([0.0, 0.3, 1.5]), 0.05
-    response = np.zeros((7, 2))
+    response = np.zeros((7, 5))
     response[[2, 5], 0] = 1.0
     back = np.array([0.0, 0.0, 0.02])
     seen = dataclasses.replace(cylinder_sighting(), point_a_m=a + back, point_b_m=b + back, by_depth=response)
@@ -191,6 +193,7 @@ def test_a_cylinder_seen_too_far_by_the_depth_offset():
         values.insert(key, point)
     values.insert(keys.radius(0), np.array([r]))
     values.insert(keys.DEPTH, np.array([-0.02, 0.0]))
+    values.insert(keys.DEPTH_RAYS, np.zeros(3))
     factor = pipe.cylinder_factor(seen, gaussian(np.eye(5) * 1e-4), keys.base(0), 0)
     np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-12)
     values.update(keys.DEPTH, np.zeros(2))

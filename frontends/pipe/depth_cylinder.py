@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...factors.camera import CameraModel
+from ...factors.cloud import depth_moves
 from ...factors.measurements import CylinderSighting, Rejection
 from ..cloud.frontend import trusted_pixels
 from ..cloud.noise import SMOOTH_SHARE, DepthModel, depth_noise
@@ -132,17 +133,17 @@ def cylinder_near(
 
 
 def depth_response(points: Float, fit: CylinderFit) -> Float:
-    """How a fit follows its depth camera's errors: d (point_a, point_b, radius) / d (offset, scale), shape (7, 2).
+    """How a fit follows its depth camera's errors: d (point_a, point_b, radius) / d (depth states), shape (7, 5).
 
-    True depth is measured * (1 + scale) + offset, so a point p moves by p / z and by p; the least squares follow.
+    The points move as `depth_moves` says; the least squares follow.
     """
     middle = 0.5 * (fit.point_a_m + fit.point_b_m)
     axis = Axis.of(middle, fit.axis, fit.radius_m, middle)
     _, jacobian = axis.residuals(points)
     unit = -jacobian[:, :2] @ axis.across
-    by_scale = (unit * points).sum(axis=1)
-    change = -np.linalg.lstsq(jacobian, np.column_stack((by_scale / points[:, 2], by_scale)), rcond=None)[0]
-    response = np.zeros((7, 2))
+    outwards = np.einsum("ni,nik->nk", unit, depth_moves(points))
+    change = -np.linalg.lstsq(jacobian, outwards, rcond=None)[0]
+    response = np.zeros((7, 5))
     for rows, end in ((slice(0, 3), fit.point_a_m), (slice(3, 6), fit.point_b_m)):
         arm = float((end - middle) @ fit.axis)
         response[rows] = axis.across.T @ (change[:2] + arm * change[2:4])
