@@ -100,6 +100,11 @@ class Engine:
         """Keyframes since the last update."""
         self.end_ns = 0
 
+    @property
+    def base(self) -> int:
+        """Key of `o_T_b` of the present station."""
+        return keys.base(0)
+
     # The loop -------------------------------------------------------------------------------------------------
 
     def add(self, bundle: Bundle) -> bool:

@@ -10,7 +10,7 @@ from surecut.factors.measurements import CylinderSighting, Rejection
 from surecut.factors.pipe import across_axis, cylinder_covariance
 from surecut.factors.rig import Kinect
 from surecut.frontends.cloud.noise import depth_noise
-from surecut.frontends.pipe.depth_cylinder import PredictedPipe, cylinder_near
+from surecut.frontends.pipe.depth_cylinder import DepthImages, PredictedPipe, cylinder_near
 
 AXIS, POINT, RADIUS = np.array([0.12, 0.97, -0.2]), np.array([0.1, 0.0, 1.4]), 0.04
 CAMERA = camera_model(640, 480, 585.0)
@@ -36,9 +36,10 @@ def predicted(shift=(0.0, 0.0, 0.0), sigma=0.015, radius=RADIUS):
 
 def search(pipes, prediction, **kind):
     sensor = DepthSensor(Kinect())
-    clouds = [sensor.image(i, image(pipes, i, **kind), CAMERA) for i in range(DEPTH_FRAMES)]
-    assert [cloud is not None for cloud in clouds] == [False] * (DEPTH_FRAMES - 1) + [True]
-    return sensor.cylinder("pipe0", prediction)
+    views = [sensor.image(i, image(pipes, i, **kind), CAMERA) for i in range(DEPTH_FRAMES)]
+    assert [view is not None for view in views] == [False] * (DEPTH_FRAMES - 1) + [True]
+    points = DepthImages(CAMERA, "kinect_v1").points_near(views[-1].depth_m, prediction)
+    return cylinder_near(0, "pipe0", points, "kinect_v1", prediction)
 
 
 def error(found):
@@ -98,14 +99,13 @@ def test_the_fit_follows_the_depth_camera_as_it_says():
 
 def test_a_point_cloud_serves_where_no_image_comes():
     sensor = DepthSensor(Kinect())
-    assert sensor.cylinder("pipe0", predicted()) is None
     z = image([Cylinder(POINT, AXIS, RADIUS)]).astype(float)
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width]
     points = np.dstack(((u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z))[::2, ::2].reshape(-1, 3)
     assert sensor.cloud_due(0)
-    cloud = sensor.cloud(0, points)
-    assert len(cloud.points_m) > 500
+    view = sensor.cloud(0, points)
+    assert len(view.cloud.points_m) > 500
     assert not sensor.cloud_due(1)
-    found = sensor.cylinder("pipe0", predicted())
+    found = cylinder_near(0, "pipe0", view.points_m, "kinect_v1", predicted())
     assert isinstance(found, CylinderSighting)
     assert found.radius_m == pytest.approx(RADIUS, abs=0.004)
