@@ -25,6 +25,7 @@ from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
+    Advice,
     CalibrationEstimate,
     Consistency,
     DistanceEstimate,
@@ -78,11 +79,17 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            advice=self._advice(points),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
+        engine = self._engine
+        if not engine.advises:
+            return {}
+        return advise(engine, self._values, self._system, self._active, points, self._inflation)
 
     def _tell_corner_rms(self) -> None:
         """Distance of the accepted corners from where the solution puts them."""

@@ -42,7 +42,10 @@ class Motion(Section):
     """The mobile camera's way: in front of the board, round the panel, three places with the pipe in view."""
 
     duration_s: Positive = 20.0
-    keyframe_rate_hz: Positive = 3.0
+    keyframe_turn_rad: Positive = 0.2
+    """A keyframe at the latest after this turn, this way, and this time: the map has to stay in view."""
+    keyframe_way_m: Positive = 0.25
+    keyframe_time_s: Positive = 1.0
     board_share: Annotated[float, Field(gt=0.0, lt=0.8)] = 0.3
     """Share of the time spent before the board."""
     style: Literal["smooth", "sharp"] = "smooth"
@@ -53,11 +56,11 @@ class Motion(Section):
 class Tracks(Section):
     """Features of the mobile stereo pair."""
 
-    per_frame: Count = 80
+    per_frame: Count = 70
     sigma_px: Positive = 0.25
     right_share: Share = 0.9
     """Share of the features that are found in the right image too."""
-    mean_life_frames: Positive = 12.0
+    mean_life_frames: Positive = 20.0
     motion_sigma_m: NonNegative = 0.003
     motion_sigma_rad: NonNegative = 0.0006
     """Of the front end's motion from frame to frame: a first guess only."""
@@ -72,7 +75,7 @@ class Clouds(Section):
     """Kinect depth images. 0 frames: no Kinect."""
 
     frames: Count = 2
-    points: Count = 3000
+    points: Count = 2000
 
 
 class Picks(Section):

@@ -22,7 +22,7 @@ from surecut.simulation.measurement_level_scenario import Scenario
 SHORT = Scenario.model_validate(
     {
         "name": "short",
-        "motion": {"duration_s": 16.0, "keyframe_rate_hz": 3.0},
+        "motion": {"duration_s": 16.0},
         "tracks": {"per_frame": 50},
         "clouds": {"frames": 0},
     }
