@@ -60,7 +60,7 @@ class Scene:
 def build_scene(scenario: Scenario, radius_m: float, rng: np.random.Generator) -> Scene:
     """A room with machine front, panel, crates and the pipe at a random place."""
     side = float(rng.choice([-1.0, 1.0]))
-    pipe_xy = np.array([rng.uniform(1.9, 2.2), rng.uniform(-0.25, 0.25)])
+    pipe_xy = np.array([rng.uniform(*scenario.pipe.distance_m), rng.uniform(*scenario.pipe.offset_m)])
     tilt = rng.normal(0.0, 0.03, 2)
     axis = np.array([tilt[0], tilt[1], 1.0])
     pipe = Cylinder(np.array([*pipe_xy, 0.2]), axis / np.linalg.norm(axis), 2.2, radius_m)
@@ -95,7 +95,8 @@ def mobile_path(scene: Scene, board: Float, motion: Motion, rng: np.random.Gener
     share, end = motion.board_share, motion.duration_s
     pipe = scene.pipe.base + 1.0 * scene.pipe.axis
     turn = rng.uniform(-0.1, 0.1, (8, 3))
-    start = board + rng.uniform([1.0, -0.25, -0.1], [1.25, 0.25, 0.15])
+    near, far = motion.board_distance_m
+    start = board + rng.uniform([near, -0.25, -0.1], [far, 0.25, 0.15])
     places = [pipe + _around(angle, scene.side, rng.uniform(0.9, 1.3)) for angle in (-0.7, 0.0, 0.7)]
     way = np.array(
         [
