@@ -32,6 +32,7 @@ from .marker_points import parse_point
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
+    Advice,
     CalibrationEstimate,
     Consistency,
     DistanceEstimate,
@@ -83,11 +84,17 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation),
+            advice=self._advice(points),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
+        engine = self._engine
+        if not engine.advises:
+            return {}
+        return advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation)
 
     def _tell_corner_rms(self) -> None:
         """Distance of the accepted corners from where the solution puts them."""
@@ -343,7 +350,7 @@ class Summary:
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
-        cylinders = cylinder_tests(engine.depth_pipes, self._active, self._system, self._values)
+        cylinders = cylinder_tests(self._engine.depth_pipes, self._active, self._system, self._values)
         priors += cylinders
         paths |= {t.record.what: t.sigma for t in cylinders}
         return judge(families, priors, paths)
