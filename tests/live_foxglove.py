@@ -24,6 +24,7 @@ class Viewer:
                 compression=None,
                 proxy=None,
                 max_size=None,
+                close_timeout=1.0,
                 **options,
             )
         )

@@ -256,7 +256,12 @@ def test_bytes_that_are_no_text_end_the_connection_only():
 def test_a_stalled_viewer_loses_the_oldest_and_holds_up_nobody():
     with serving(client_bytes=300_000) as (server, _), Viewer(server.port) as lively:
         with connect(
-            f"ws://127.0.0.1:{server.port}", subprotocols=["foxglove.sdk.v1"], compression=None, proxy=None, max_queue=1
+            f"ws://127.0.0.1:{server.port}",
+            subprotocols=["foxglove.sdk.v1"],
+            compression=None,
+            proxy=None,
+            max_queue=1,
+            close_timeout=0.1,
         ) as stalled:
             big = live_image(0)
             server.image(type(big)("/i", 1, "m_left", np.zeros((300, 400), np.uint8)))
@@ -296,7 +301,7 @@ def test_a_thousand_malformed_messages_a_second_do_not_stop_the_poses():
     def spam(port: int) -> None:
         nonlocal sent
         with connect(
-            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], compression=None, proxy=None
+            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], compression=None, proxy=None, close_timeout=0.1
         ) as connection:
             begun = time.monotonic()
             while not stop.is_set():
