@@ -39,7 +39,7 @@ class BatchSolution:
 
 def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
     """Robust Levenberg-Marquardt; then what is beyond noise is taken out, first by its residual, then by snooping."""
-    first, iterations = _optimise(log.graph(), start)
+    first, iterations = optimum(log.graph(), start)
     values = first
     off: set[int] = set()
     rejected: list[Rejection] = []
@@ -53,12 +53,12 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             alone = orphans(log, off)
             rejected += [r for _, r in alone]
             off |= {i for i, _ in alone}
-            values, more = _optimise(_without(log, off), values)
+            values, more = optimum(_without(log, off), values)
             iterations += more
     return BatchSolution(values, first, tuple(sorted(off)), tuple(rejected), iterations)
 
 
-def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-6)
     parameters.setAbsoluteErrorTol(1e-4)

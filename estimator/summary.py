@@ -21,6 +21,7 @@ from .consistency import family_tests, judge, prior_tests
 from .correlation import Active, inflated_system
 from .engine import Engine, distance_name
 from .marker_points import parse_point
+from .motions import motions
 from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
@@ -82,6 +83,7 @@ class Summary:
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
+            motions=motions(self._values, self._system, engine.odometry.keyframe_stamps),
         )
 
     def _tell_corner_rms(self) -> None:
