@@ -18,11 +18,9 @@ from .advice import advise
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
-from .correlation import Active, inflated_system
 from .engine import Engine, distance_name
 from .marker_points import parse_point
 from .motions import motions
-from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
@@ -48,9 +46,7 @@ class Summary:
         self._engine = engine
         self._values = solution.values
         self._solution = solution
-        off = set(solution.outliers)
-        self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
+        self._active, self._system = solution.at.active, solution.at.system
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -79,7 +75,7 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            advice=advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
@@ -325,10 +321,7 @@ class Summary:
     # Consistency ----------------------------------------------------------------------------------------------
 
     def _consistency(self) -> Consistency:
-        engine = self._engine
-        families = family_tests(
-            engine.solver.log, self._active, self._system, self._values, engine.rig.gates.robust_sigma
-        )
+        families = family_tests(self._solution.at)
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
