@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.noise import robust_scale
-from .correlation import Active, track_inflation
+from .correlation import Active, correlate
 from .graph import FactorLog
 from .linear import LinearSystem
 
@@ -52,8 +52,8 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
 
 def with_correlated_tracks(at: Linearised, family: str) -> Linearised:
     """The same with covariances that know that the errors of a family's tracks are correlated."""
-    records = [record for _, _, record in at.active]
-    at.system.inflation[:] = track_inflation(records, at.system, family)
-    of_tracks = np.repeat([r.family == family for r in records], at.system.rows)
-    mean = float(at.system.inflation[of_tracks].mean()) if of_tracks.any() else 1.0
-    return Linearised(at.values, at.active, at.system, at.norms, mean)
+    found = correlate(at.active, at.values, at.system, family)
+    if found is None:
+        return at
+    at.system.root = found.root
+    return Linearised(at.values, at.active, at.system, at.norms, found.inflation)

@@ -4,11 +4,14 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.geometry import ros_covariance
 from .linear import LinearSystem
 from .result import MotionEstimate
+
+Float = NDArray[np.float64]
 
 WINDOW_NS = 1_000_000_000
 MOST = 60
@@ -46,7 +49,11 @@ def _motion(
     """The joint of both poses: errors that they share cancel in the motion between them."""
     before, after = keys.keyframe(first), keys.keyframe(last)
     motion = values.atPose3(before).between(values.atPose3(after))
-    # Tangents in the body frames: xi_motion = xi_after - Ad(motion^-1) xi_before.
-    blocks = [(before, -motion.inverse().AdjointMap()), (after, np.eye(6))]
-    covariance = ros_covariance(motion, system.covariance(blocks))
+    covariance = ros_covariance(motion, system.covariance(motion_blocks(values, before, after)))
     return MotionEstimate(stamps_ns[first], stamps_ns[last], motion.matrix(), covariance)
+
+
+def motion_blocks(values: gtsam.Values, before: int, after: int) -> list[tuple[int, Float]]:
+    """Jacobian of the pose of one keyframe in another: in the body frames xi = xi_after - Ad(motion^-1) xi_before."""
+    motion = values.atPose3(before).between(values.atPose3(after))
+    return [(before, -motion.inverse().AdjointMap()), (after, np.eye(6))]
