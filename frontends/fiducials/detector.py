@@ -1,6 +1,6 @@
 """The marker front end of one camera: images in, corners with covariances out, at video rate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -20,6 +20,8 @@ Float = NDArray[np.float64]
 
 CORNER_FLOOR_PX = 0.004
 """What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
+COMMON_PX = 0.01
+"""Error that two images from one place have in common, in rendered images of all sizes (docs/corners.md)."""
 _MIN_CORRELATION = 0.80
 """Pixels with the fitted pattern, for a marker that was read."""
 _MIN_CORRELATION_PREDICTED = 0.90
@@ -42,6 +44,8 @@ class _Fitted:
     covariance: Float
     correlation: float
     contrast: float
+    structure: float
+    """Share of the covariance that is not the pixels' noise."""
     problem: tuple[str, float, float] | None
     """Reason, value and limit of a refusal."""
 
@@ -184,6 +188,7 @@ class MarkerFrontEnd:
             fitted.corners,
             blocks + CORNER_FLOOR_PX**2 * np.eye(2),
             distort(self._camera, fitted.corners),
+            float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2 + COMMON_PX**2)),
         )
 
     def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:
@@ -224,18 +229,12 @@ def _judged(candidate: Candidate, start: Float, fit: PatternFit, k: int, cells: 
         problem = ("the fit did not settle, last step in px", float(fit.last_step_px[k]), _SETTLED_PX)
     elif moved > 1.5:
         problem = ("the fit left the marker, move in cells", moved, 1.5)
-    return _Fitted(candidate, corners, covariance, float(fit.correlation[k]), float(fit.contrast[k]), problem)
+    correlation, contrast, structure = (float(x[k]) for x in (fit.correlation, fit.contrast, fit.structure))
+    return _Fitted(candidate, corners, covariance, correlation, contrast, structure, problem)
 
 
 def _refused(fitted: _Fitted, reason: str, value: float, limit: float) -> _Fitted:
-    return _Fitted(
-        fitted.candidate,
-        fitted.corners,
-        fitted.covariance,
-        fitted.correlation,
-        fitted.contrast,
-        (reason, float(value), float(limit)),
-    )
+    return replace(fitted, problem=(reason, float(value), float(limit)))
 
 
 def _distinct(fitted: list[_Fitted]) -> list[_Fitted]:

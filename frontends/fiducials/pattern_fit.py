@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .pattern_model import PatternModel, corner_basis, homography, pattern_model, second_difference
 from .pixel_choice import Choice, Pixels, Windows, choose_pixels, surroundings
+from .pixel_noise import pixel_noise
 
 # NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
 Float = NDArray[Any]
@@ -69,6 +70,9 @@ class PatternFit:
     """Shape (m,), what the last step moved a corner by (part of the covariance); large where the fit did not settle."""
     noise_factor: Float
     """Shape (m,), how much residuals that hang together raise the variance over white noise of the same size."""
+    structure: Float
+    """Shape (m,), share of the covariance that is not the noise of the pixels but what the model does not know of
+    print, lens and light: it comes back in the next image from the same place."""
 
 
 def fit_patterns(
@@ -109,7 +113,7 @@ def fit_patterns(
     pixels = choose_pixels(image, positions, windows, coarse, patterns, Choice(reach, _LATTICE, _MAX_PIXELS))
     state = _State(coarse - pixels.origin[:, None], state.blur, state.tone, state.light)
     state, solved = _descend(state, pixels, D, lines, steps, False)
-    return _summary(state, solved, pixels)
+    return _summary(state, solved, pixels, pixel_noise(image, windows))
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +268,7 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
     return np.sqrt(np.clip(1.0 - left / np.maximum(spread, 1e-9), 0.0, 1.0)).astype(float)
 
 
-def _summary(state: _State, solved: _Solved, pixels: Pixels) -> PatternFit:
+def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> PatternFit:
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
@@ -282,6 +286,7 @@ def _summary(state: _State, solved: _Solved, pixels: Pixels) -> PatternFit:
         _share(solved, pixels),
         last_step,
         factor,
+        np.clip(1.0 - (noise**2 + _ROUNDING**2) / (variance * factor), 0.0, 1.0),
     )
 
 
