@@ -23,13 +23,14 @@ from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
-from .agreement import cylinder_tests
+from .agreement import cylinder_event, cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .correlation import Active, inflated_system
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
+from .mount_check import mount_test
 from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
@@ -352,6 +353,12 @@ class Summary:
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
         cylinders = cylinder_tests(engine.depth_pipes, self._active, self._system, self._values)
         priors += cylinders
+        told = tuple(cylinder_event(test) for test in cylinders)
+        mount = mount_test(engine, self._active, self._values)
+        if mount is not None:
+            paths[mount.name] = mount.sigma
+            told = (*told, mount.event())
+        engine.events += [event for event in told if event is not None]
         paths |= {t.record.what: t.sigma for t in cylinders}
         return judge(families, priors, paths)
 
