@@ -67,8 +67,12 @@ COLOUR_GATE_PX = 5.0
 class Engine:
     """Graph, iSAM2 and the sensors' book-keeping of one run."""
 
-    def __init__(self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator) -> None:
+    def __init__(
+        self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator, advises: bool = True
+    ) -> None:
         self.rig = rig
+        self.advises = advises
+        """The result tells what to measure next; campaigns do without."""
         self.cameras = dict(cameras)
         self.state = State()
         self.solver = Incremental()

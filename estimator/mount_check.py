@@ -15,7 +15,8 @@ from ..factors.noise import pose_sigmas, robust, sigmas
 from ..frontends.cloud.associate import associate
 from ..frontends.cloud.noise import SMOOTH_SHARE
 from ..frontends.cloud.point_registration import register_points
-from .agreement import ERROR_SIGMA, TOLD_SIGMA, cylinder_test
+from .agreement import ERROR_SIGMA, TOLD_SIGMA, cylinder_event, cylinder_test, cylinder_tests
+from .consistency import PriorTest
 from .correlation import Active
 from .depth_pipes import FAMILY as CYLINDER
 from .depth_pipes import SeenCylinder
@@ -68,7 +69,22 @@ class MountTest:
         return Event(self.stamp_ns, "mount_wrong", text, "error" if self.sigma > ERROR_SIGMA else "warning", values)
 
 
-def mount_test(engine: Engine, active: Active, values: gtsam.Values) -> MountTest | None:
+def compared_with_cloud(
+    engine: Engine, active: Active, system: LinearSystem, values: gtsam.Values
+) -> tuple[list[PriorTest], dict[str, float]]:
+    """Pipes and mount against the Kinect's cloud: tests, and disagreements in sigmas by name. Tells the engine."""
+    tests = cylinder_tests(engine.depth_pipes, active, system, values)
+    ways = {test.record.what: test.sigma for test in tests}
+    told = [cylinder_event(test) for test in tests]
+    mount = mount_test(engine, active, system, values)
+    if mount is not None:
+        ways[mount.name] = mount.sigma
+        told.append(mount.event())
+    engine.events += [event for event in told if event is not None]
+    return tests, ways
+
+
+def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gtsam.Values) -> MountTest | None:
     """Places {b} by the cloud, without the mount, and compares. None where the cloud does not hold it.
 
     The landmarks' places come from all other factors, so both ways share the mobile camera's map; the covariance of
@@ -87,18 +103,20 @@ def mount_test(engine: Engine, active: Active, values: gtsam.Values) -> MountTes
     start = gtsam.Values(values)
     start.update(base, pose3(placed.o_T_b))
     planes = _planes(found, cloud, base, start, engine.rig.gates.robust_sigma)
-    factors = [f for _, f, r in active if r.family not in ("mount", CLOUD, CYLINDER)] + planes
+    kept = [i for i, (_, _, record) in enumerate(active) if record.family not in ("mount", CLOUD, CYLINDER)]
+    inflation = np.concatenate([system.inflation[system.starts[i] : system.starts[i + 1]] for i in kept])
+    factors = [active[i][1] for i in kept] + planes
     factors.append(weak_pose_prior(base, start.atPose3(base), 1.0, 1.0))
-    system = _system(factors, start)
-    solved = _solved(system, start)
-    pipes = [seen for seen in engine.depth_pipes.seen.values() if _fits(seen, system, solved)]
+    without = _system(factors, start, inflation)
+    solved = _solved(without, start)
+    pipes = [seen for seen in engine.depth_pipes.seen.values() if _fits(seen, without, solved)]
     if pipes:
-        system = _system(factors + [seen.factor() for seen in pipes], solved)
-        solved = _solved(system, solved)
+        without = _system(factors + [seen.factor() for seen in pipes], solved, inflation)
+        solved = _solved(without, solved)
     unit = gtsam.BetweenFactorPose3(engine.boards.key(mount.board), base, mount_pose(mount), pose_sigmas(1.0, 1.0))
     linear = unit.linearize(solved)
     J, residual = linear.jacobian()
-    spread = system.covariance([(k, J[:, 6 * i : 6 * i + 6]) for i, k in enumerate(linear.keys())])
+    spread = without.covariance([(k, J[:, 6 * i : 6 * i + 6]) for i, k in enumerate(linear.keys())])
     if np.sqrt(np.diag(spread)).max() > WEAK_SIGMA:
         return None
     own = np.diag([mount.rotation_sigma_rad**2] * 3 + [mount.translation_sigma_m**2] * 3)
@@ -110,11 +128,14 @@ def mount_test(engine: Engine, active: Active, values: gtsam.Values) -> MountTes
     )  # fmt: skip
 
 
-def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values) -> LinearSystem:
+def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, inflation: Float) -> LinearSystem:
+    """The linear system of factors, the first rows' errors as correlated as in the full one."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
-    return LinearSystem(graph, values)
+    system = LinearSystem(graph, values)
+    system.inflation[: len(inflation)] = inflation
+    return system
 
 
 def _fits(seen: SeenCylinder, system: LinearSystem, values: gtsam.Values) -> bool:

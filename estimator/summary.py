@@ -23,18 +23,16 @@ from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
-from .agreement import cylinder_event, cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
-from .correlation import Active, inflated_system
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
-from .mount_check import mount_test
-from .odometry import FAMILY as ODOMETRY
+from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
+    Advice,
     CalibrationEstimate,
     Consistency,
     DistanceEstimate,
@@ -57,9 +55,7 @@ class Summary:
         self._engine = engine
         self._values = solution.values
         self._solution = solution
-        off = set(solution.outliers)
-        self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
+        self._active, self._system = solution.at.active, solution.at.system
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -88,11 +84,17 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            advice=self._advice(points),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
+        engine = self._engine
+        if not engine.advises:
+            return {}
+        return advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation)
 
     def _tell_corner_rms(self) -> None:
         """Distance of the accepted corners from where the solution puts them."""
@@ -344,23 +346,12 @@ class Summary:
     # Consistency ----------------------------------------------------------------------------------------------
 
     def _consistency(self) -> Consistency:
-        engine = self._engine
-        families = family_tests(
-            engine.solver.log, self._active, self._system, self._values, engine.rig.gates.robust_sigma
-        )
+        families = family_tests(self._solution.at)
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
-        cylinders = cylinder_tests(engine.depth_pipes, self._active, self._system, self._values)
-        priors += cylinders
-        told = tuple(cylinder_event(test) for test in cylinders)
-        mount = mount_test(engine, self._active, self._values)
-        if mount is not None:
-            paths[mount.name] = mount.sigma
-            told = (*told, mount.event())
-        engine.events += [event for event in told if event is not None]
-        paths |= {t.record.what: t.sigma for t in cylinders}
-        return judge(families, priors, paths)
+        cylinders, ways = compared_with_cloud(self._engine, self._active, self._system, self._values)
+        return judge(families, [*priors, *cylinders], {**paths, **ways})
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""
