@@ -20,19 +20,6 @@ TAKEN = 0.75
 """Parameters of a landmark per row of one of its views (two cameras, two rows each)."""
 
 
-def inflated_system(active: Active, values: gtsam.Values, family: str) -> tuple[LinearSystem, float]:
-    """The linear system of factors at an estimate, its covariances those of correlated tracks; and their factor."""
-    graph = gtsam.NonlinearFactorGraph()
-    for _, factor, _ in active:
-        graph.add(factor)
-    system = LinearSystem(graph, values)
-    records = [record for _, _, record in active]
-    inflation = track_inflation(records, system, family)
-    of_tracks = np.array([r.family == family for r in records])
-    system.inflation[np.repeat(of_tracks, system.rows)] = inflation
-    return system, inflation
-
-
 def track_inflation(records: list[Record], system: LinearSystem, family: str) -> float:
     """Factor by which white-noise variances understate what tracks with correlated errors leave in an estimate.
 
