@@ -39,6 +39,9 @@ def command(
     decisions: Annotated[
         bool, typer.Option("--decisions", help="Decide random cuts in every run: wrong GOs, and power.")
     ] = False,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Change one input after the other: how far do the points move?")
+    ] = False,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
     range_file: Annotated[
@@ -50,7 +53,7 @@ def command(
     if real is not None:
         _real(console, real, output, validation, choose_executor(jobs, dask))
         return
-    campaign = open_campaign(scenario, level, leave_out, decisions)
+    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity)
     with _bar(console) as progress:
         task = progress.add_task("runs", total=runs)
         executor = choose_executor(jobs, dask)
