@@ -110,6 +110,17 @@ def test_a_clock_that_jumped_is_believed_after_a_while():
     assert (counters["stamp_outlier"], counters["clock_jumps"], counters["delivered"]) == (3, 1, 5 + 16)
 
 
+def test_a_click_in_an_old_image_and_a_calibration_of_long_ago_are_let_in():
+    now = START + 60 * SECOND
+    intake, found = Intake(lambda: now, expected_bodies(RIG)), Collector()
+    intake.open(found)
+    intake.take(channel("/picks", PICK), pick())
+    for _ in range(3):
+        intake.take(channel("/m/left/camera_info", INFO), info())
+        now += 20 * SECOND
+    assert [message.stamp_ns for message in found.messages] == [START, 0, 0, 0]
+
+
 def test_scattered_stamps_are_never_believed():
     intake, found = Intake(lambda: START), Collector()
     intake.open(found)

@@ -209,6 +209,7 @@ def test_the_estimate_goes_back_to_the_robot():
     read = read_attachment(attachment)
     assert read is not None
     assert read.sequence >= 1
+    assert any(token.endswith("/0/0/NN/%/%/surecut") for token in tokens)
     assert any(
         "%estimate%points/surecut_msgs::msg::dds_::PointWithCovarianceArray_/RIHS01_" in token for token in tokens
     )
