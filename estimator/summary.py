@@ -8,22 +8,32 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.board import mean_point
-from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
+from ..factors.calibration import (
+    depth_ray_sigmas,
+    depth_sigmas,
+    intrinsics_covariance,
+    left_T_right,
+    rgb_mean,
+    rgb_sigmas,
+    stereo_sigmas,
+)
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
 from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
+from .agreement import cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
-from .engine import Engine, distance_name
+from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
 from .motions import motions
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
+    Advice,
     CalibrationEstimate,
     Consistency,
     DistanceEstimate,
@@ -75,12 +85,18 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation),
+            advice=self._advice(points),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
             motions=motions(self._values, self._system, engine.odometry.keyframe_stamps),
         )
+
+    def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
+        engine = self._engine
+        if not engine.advises:
+            return {}
+        return advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation)
 
     def _tell_corner_rms(self) -> None:
         """Distance of the accepted corners from where the solution puts them."""
@@ -224,6 +240,17 @@ class Summary:
             rows.append(
                 CalibrationEstimate("depth_scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
             )
+            value, sigma = self._values.atVector(keys.DEPTH_RAYS), self._sigmas(keys.DEPTH_RAYS)
+            camera, model = rig.cameras.b_depth, engine.cameras.get("b_depth")
+            prior = depth_ray_sigmas(camera, NOMINAL_DEPTH_FOCAL_PX if model is None else model.fx)
+            names = (("x", "centre"), ("y", "centre"), ("scale", "focal"))
+            for i, (part, settled) in enumerate(names):
+                rows.append(
+                    CalibrationEstimate(
+                        f"depth_ray_{part}", "1" if i == 2 else "rad", value[i], sigma[i], 0.0, prior[i],
+                        settled in camera.freeze,
+                    )
+                )  # fmt: skip
         for board in rig.boards:
             page = keys.page(engine.boards.index(board.id))
             if self._values.exists(page):
@@ -325,6 +352,9 @@ class Summary:
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
+        cylinders = cylinder_tests(self._engine.depth_pipes, self._active, self._system, self._values)
+        priors += cylinders
+        paths |= {t.record.what: t.sigma for t in cylinders}
         return judge(families, priors, paths)
 
     def _streaming_difference(self) -> dict[str, float]:
