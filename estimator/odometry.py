@@ -138,7 +138,7 @@ class Odometry:
         kept, rejected, shift = self._gated_together(frame, living, pose)
         again, more, drift = self._gated_together(frame, back, pose)
         excess = float(np.linalg.norm(drift - shift))
-        if kept and again and excess > self._settings.gate_px:
+        if again and not self._since_keyframe_lost and excess > self._settings.gate_px:
             sigmas = self._drift_sigmas(frame, again, pose, shift)
             if sigmas > self._settings.gate_sigma:
                 reason = "seen again, beyond what drift explains, sigmas"
