@@ -118,7 +118,7 @@ def test_knock_while_the_board_is_in_view():
     assert_only(result, "board_knocked")
     (event,) = told(result, "board_knocked")
     assert event.values["before_ns"] - run.truth.stamps_ns[0] < 2e9 <= event.stamp_ns - run.truth.stamps_ns[0]
-    assert event.stamp_ns - event.values["before_ns"] < 1e9
+    assert event.stamp_ns - event.values["before_ns"] <= 1e9  # keyframes at rest are a second apart
     assert abs(event.values["moved_m"] - np.hypot(0.02, 0.01)) < 3 * event.values["moved_sigma_m"]
     assert abs(event.values["turned_rad"] - 0.06) < 3 * event.values["turned_sigma_rad"]
     assert "mount (f_T_b) holds for the time before only" in event.text
