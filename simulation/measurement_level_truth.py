@@ -1,17 +1,18 @@
 """The truth of one run: the rig as it really is, and where everything was. Only the evaluation reads it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..factors.board import CORNER_PRINT_SIGMA_M, DIRECTIONS, marker_rotation
-from ..factors.calibration import ASPECT_REL
+from ..factors.calibration import ASPECT_REL, depth_ray_sigmas
 from ..factors.rig import Board, Pose, Rig
 
 Float = NDArray[np.float64]
 
+KINECT_FOCAL_PX = 585.0
 START_DISTANCE_M = 1.15
 """Of the mobile camera from the board when it first sees it."""
 
@@ -56,6 +57,8 @@ class TrueRig:
     depth_scale: float
     """True depth is measured depth times (1 + scale), plus the offset."""
     boards: dict[str, TrueBoard]
+    depth_rays: Float = field(default_factory=lambda: np.zeros(3))
+    """Shape (3,): true rays of the depth camera are the given ones times (1 + the last), plus the first two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +113,7 @@ def draw_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float, rng: n
         depth_offset_m=float(rng.normal(0.0, kinect.depth_offset_sigma_m)),
         depth_scale=float(rng.normal(0.0, kinect.depth_scale_sigma)),
         boards={board.id: draw_board(board, rng, _lasting_m(rig, cameras)) for board in rig.boards},
+        depth_rays=rng.spawn(1)[0].normal(0.0, depth_ray_sigmas(rig.cameras.b_depth, KINECT_FOCAL_PX)),
     )
 
 
