@@ -45,6 +45,7 @@ from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
 from .observability import why_no_base
+from .odometry import FAMILY as ODOMETRY
 from .odometry import FramePose, Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .placement import place
@@ -461,8 +462,13 @@ class Engine:
             )
             for p in self.lost_picks()
         ]
+        given_up = [
+            Rejection(self.end_ns, ODOMETRY, keys.words(key), "undetermined where its matches put it; views", 0.0, 1.0)
+            for key in self.solver.dropped
+        ]
         return [
             *self.rejected,
+            *given_up,
             *self.boards.rejected,
             *self.boards.held_back(),
             *self.pipes.rejected,

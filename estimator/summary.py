@@ -28,6 +28,7 @@ from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
+from .motions import motions
 from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
@@ -88,6 +89,7 @@ class Summary:
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
+            motions=motions(self._values, self._system, engine.odometry.keyframe_stamps),
         )
 
     def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:

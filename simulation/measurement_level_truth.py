@@ -1,6 +1,6 @@
 """The truth of one run: the rig as it really is, and where everything was. Only the evaluation reads it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +56,9 @@ class TrueRig:
     depth_offset_m: float
     depth_scale: float
     """True depth is measured depth times (1 + scale), plus the offset."""
+    depth_rays: Float
+    """How the depth camera's rays lie beside those of its calibration: shift x, shift y [rad], scale."""
     boards: dict[str, TrueBoard]
-    depth_rays: Float = field(default_factory=lambda: np.zeros(3))
-    """Shape (3,): true rays of the depth camera are the given ones times (1 + the last), plus the first two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +112,8 @@ def draw_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float, rng: n
         f_T_b=f_T_b,
         depth_offset_m=float(rng.normal(0.0, kinect.depth_offset_sigma_m)),
         depth_scale=float(rng.normal(0.0, kinect.depth_scale_sigma)),
+        depth_rays=rng.normal(0.0, depth_ray_sigmas(rig.cameras.b_depth, KINECT_FOCAL_PX)),
         boards={board.id: draw_board(board, rng, _lasting_m(rig, cameras)) for board in rig.boards},
-        depth_rays=rng.spawn(1)[0].normal(0.0, depth_ray_sigmas(rig.cameras.b_depth, KINECT_FOCAL_PX)),
     )
 
 
@@ -133,6 +133,7 @@ def nominal_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float) -> 
         f_T_b=pose(rig.mount.f_T_b),
         depth_offset_m=0.0,
         depth_scale=0.0,
+        depth_rays=np.zeros(3),
         boards={board.id: draw_board(board, None) for board in rig.boards},
     )
 
