@@ -59,7 +59,10 @@ def not_observable(key: int) -> str:
 def why_no_base(mount: Mount | None, board_known: bool) -> str:
     """The missing link between {o} and {b}, in words."""
     if mount is None:
-        return "{b} is not observable: the rig has no mount (f_T_b); add the section `mount` to the rig file"
+        return (
+            "{b} is not observable: the rig has no mount (f_T_b), and Kinect and mobile camera share too few textured "
+            "surfaces; add the section `mount` to the rig file, or show both cameras the same things"
+        )
     if not board_known:
         return (
             f"{{b}} is not observable: board {mount.board} was never seen well enough by the mobile camera; "
