@@ -149,7 +149,7 @@ def test_a_server_that_goes_and_comes_is_found_again():
         wait_for(lambda: not source.connected())
     begun = time.monotonic()
     source.stop()
-    assert time.monotonic() - begun < 2
+    assert time.monotonic() - begun < 5
     assert source.ended()
 
 
@@ -172,7 +172,7 @@ def test_the_definition_of_a_stranger_is_never_compiled(monkeypatch):
         source, _ = client(robot.port)
         wait_for(lambda: 3 in robot.subscribed)
         source.stop()
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 20
     assert source.counters()["unknown_encoding"] == 1
 
 
