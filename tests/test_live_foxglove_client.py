@@ -153,6 +153,19 @@ def test_a_server_that_goes_and_comes_is_found_again():
     assert source.ended()
 
 
+def test_an_image_is_asked_for_in_one_form():
+    zipped = "sensor_msgs/msg/CompressedImage"
+    channels = [
+        ros_channel(1, "/m/left/image_raw/compressed", zipped),
+        ros_channel(2, "/m/left/image_raw", IMAGE),
+        ros_channel(3, "/m/right/image_raw/compressed", zipped),
+    ]
+    with Robot(channels) as robot:
+        source, _ = client(robot.port, expected=expected_bodies(RIG))
+        wait_for(lambda: set(robot.subscribed) == {2, 3})
+        source.stop()
+
+
 def test_a_type_that_nobody_needs_is_not_asked_for():
     other = {"id": 1, "topic": "/tf", "encoding": "cdr", "schemaName": "tf2_msgs/msg/TFMessage", "schema": ""}
     strange = {**ros_channel(2, "/picks", PICK), "schema": "float64 something_else"}

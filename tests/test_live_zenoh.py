@@ -118,6 +118,27 @@ def test_messages_of_a_robot_arrive():
         assert body.px.tolist() == [30.5, 20.25]
 
 
+def test_the_robot_is_told_who_listens():
+    """Publishers of images send only to those whom ROS 2's graph knows."""
+    port = free_port()
+    with router(port), node("client", connect=f"tcp/127.0.0.1:{port}") as robot:
+        with started(port) as (source, _):
+            wait_for(source.connected)
+            tokens: list[str] = []
+
+            def all_there() -> bool:
+                replies = robot.liveliness().get("@ros2_lv/0/**")
+                tokens[:] = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+                return len(tokens) == 4
+
+            wait_for(all_there)
+            kinds = sorted(token.split("/")[5] for token in tokens)
+            assert kinds == ["MS", "MS", "MS", "NN"]
+            digest = key_of(0, "/m/left/image_raw", IMAGE).rsplit("/", 1)[1]
+            expected = f"surecut/%m%left%image_raw/sensor_msgs::msg::dds_::Image_/{digest}/::,1:,:,:,,"
+            assert any(token.endswith(expected) for token in tokens)
+
+
 def test_what_is_no_message_is_counted():
     port = free_port()
     limits = Limits(message_bytes=50_000)
