@@ -28,8 +28,8 @@ from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
-from .mount_check import compared_with_cloud
 from .motions import motions
+from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
