@@ -81,6 +81,7 @@ class Engine:
         self.solver = Incremental()
         sigma = rig.gates.robust_sigma
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
+        self.odometry.joint_covariance = self.solver.joint_covariance
         self.boards = Boards(rig, self.state)
         self.stations = Stations(self.state)
         self.pipes = Pipes(rig, self.state)
