@@ -150,6 +150,20 @@ class OutlineSighting:
 
 
 @dataclass(frozen=True, slots=True)
+class BaseMove:
+    """The machine was moved from one station to the next."""
+
+    start_ns: int
+    """When it began to move."""
+    stamp_ns: int
+    """Since when it has stood again."""
+    before_T_after: Float
+    """Shape (4, 4), pose of the new {b} in the old one."""
+    covariance: Float
+    """Shape (6, 6), rotation first, body frame of the new {b}; wide where the clouds do not hold it."""
+
+
+@dataclass(frozen=True, slots=True)
 class Rejection:
     """A measurement that did not enter the graph, or was switched off there, and why."""
 
