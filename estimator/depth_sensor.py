@@ -11,7 +11,7 @@ from ..factors.measurements import BaseMove, CloudFrame
 from ..factors.rig import Kinect
 from ..frontends.cloud.base_motion import BaseMotion
 from ..frontends.cloud.frontend import CloudFrontEnd, average_depth
-from ..frontends.cloud.noise import DepthModel
+from ..frontends.cloud.noise import DepthModel, depth_noise
 from ..frontends.cloud.points import cloud_from_points
 
 Float = NDArray[np.float64]
@@ -23,6 +23,10 @@ WINDOW_NS = 2_000_000_000
 
 WATCH_NS = 180_000_000
 """Between depth images in which motion of the machine is looked for."""
+REST_WATCH_NS = 1_000_000_000
+"""The same as long as the images hardly differ."""
+COARSE = 8
+"""Every so many pixels tell whether images differ."""
 FEWEST_SAMPLES = 200
 """A depth image with fewer surface samples, such as a covered one, tells nothing about motion."""
 CLOUD_POINTS = 100_000
@@ -54,6 +58,7 @@ class DepthSensor:
         self._last_cloud_ns: int | None = None
         self._motion = BaseMotion()
         self._watched_ns: int | None = None
+        self._watched: Depth = np.zeros((0, 0), np.float32)
         self._move: BaseMove | None = None
 
     def image(self, stamp_ns: int, depth_m: Depth, camera: CameraModel) -> DepthView | None:
@@ -75,9 +80,11 @@ class DepthSensor:
     def _watch(self, stamp_ns: int, depth_m: Depth) -> None:
         """Does the machine still stand where it stood?"""
         assert self._clouds is not None
-        if self._watched_ns is not None and stamp_ns - self._watched_ns < WATCH_NS:
-            return
-        self._watched_ns = stamp_ns
+        if self._watched_ns is not None:
+            due_ns = WATCH_NS if self._motion.restless or self._changed(depth_m) else REST_WATCH_NS
+            if stamp_ns - self._watched_ns < due_ns:
+                return
+        self._watched_ns, self._watched = stamp_ns, depth_m[::COARSE, ::COARSE]
         cloud = self._clouds.process(stamp_ns, depth_m)
         station = self._motion.add(cloud) if len(cloud.points_m) >= FEWEST_SAMPLES else None
         if station is None or station.previous_T_this is None:
@@ -91,6 +98,18 @@ class DepthSensor:
             covariance = covariance + turn @ self._move.covariance @ turn.T
             pose, start_ns = self._move.before_T_after @ pose, self._move.start_ns
         self._move = BaseMove(start_ns, station.start_ns, pose, covariance)
+
+    def _changed(self, depth_m: Depth) -> bool:
+        """Does a depth image differ from the last one that was looked at by more than noise?"""
+        before, now = self._watched, depth_m[::COARSE, ::COARSE]
+        both = np.isfinite(before) & np.isfinite(now)
+        if both.sum() < FEWEST_SAMPLES:
+            return True
+        noise = depth_noise(self._model)
+        z = now[both].astype(np.float64)
+        sigma = np.sqrt(2.0) * np.hypot(noise.axial(z, 0.0), noise.step(z))
+        off = (z - before[both]) / sigma
+        return bool(abs(np.median(off)) > 0.3 or (np.abs(off) > 4.0).mean() > 0.1)
 
     def cloud(self, stamp_ns: int, points_m: Float) -> DepthView:
         """A cloud (n, 3) in the depth optical frame and its surfaces."""
