@@ -74,9 +74,9 @@ class Incremental:
         """Starts iSAM2 anew from a damped batch optimum.
 
         A linearisation far from the optimum can be singular although the problem is not: new landmarks and axes start
-        from rough guesses. Levenberg-Marquardt gets across. And what hangs on a motion prior of a metre is held a billion
-        times less than what its landmarks hold, of which Cholesky's squares leave nothing: from here on it is QR. What
-        is singular for both is not observable.
+        from rough guesses. Levenberg-Marquardt gets across. And what hangs on a motion prior of a metre is held a
+        billion times less than what its landmarks hold, of which Cholesky's squares leave nothing: from here on it is
+        QR. What is singular for both is not observable.
         """
         graph = gtsam.NonlinearFactorGraph()
         self._slots = []
