@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..factors.errors import ObservabilityError
+from ..factors import keys
 from .graph import FactorLog, Update
-from .observability import determined
+from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
 
@@ -36,6 +36,10 @@ RELINEARIZE_EVERY = 10
 of a batch solution; `settle` makes up for what is left at the end."""
 
 
+MOST_DROPPED = 50
+"""Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
+
+
 class Incremental:
     """iSAM2 with the bookkeeping that lets single measurements be switched off again."""
 
@@ -45,12 +49,15 @@ class Incremental:
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
         self.log = FactorLog()
+        self.dropped: list[int] = []
+        """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
 
     def update(self, update: Update, remove: Iterable[int] = ()) -> gtsam.Values:
         """Takes the new factors and guesses, switches off the factors `remove`, and returns the estimate.
 
         Raises:
-            ObservabilityError: a variable is not determined by the factors, at any linearisation.
+            ObservabilityError: a variable other than a landmark is not determined by the factors, at any
+                linearisation.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in update.factors:
@@ -65,10 +72,29 @@ class Incremental:
                 self._isam.update(graph, update.values, slots)
             self._slots += range(first, first + len(update.factors))
             self._values = self._isam.calculateEstimate()
-        except ObservabilityError:
+        except Undetermined:
             self._values.insert(update.values)
-            self._rebuild()
+            self._restart()
         return gtsam.Values(self._values)
+
+    def _restart(self) -> None:
+        """Starts iSAM2 anew; landmarks that stay undetermined are given up, one after the other."""
+        for _ in range(MOST_DROPPED):
+            try:
+                self._rebuild()
+            except Undetermined as error:
+                if keys.kind(error.key) != "l":
+                    raise
+                self._drop(error.key)
+            else:
+                return
+        self._rebuild()
+
+    def _drop(self, landmark: int) -> None:
+        """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
+        self.dropped.append(landmark)
+        self.log.off.update(i for i, factor, _ in self.log.active() if landmark in factor.keys())
+        self._values.erase(landmark)
 
     def _rebuild(self) -> None:
         """Starts iSAM2 anew from a damped batch optimum.
@@ -96,8 +122,12 @@ class Incremental:
         """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
         empty, none = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for _ in range(rounds):
-            with determined():
-                result = self._isam.update(empty, none, force_relinearize=True)
+            try:
+                with determined():
+                    result = self._isam.update(empty, none, force_relinearize=True)
+            except Undetermined:
+                self._restart()
+                continue
             if result.getVariablesRelinearized() == 0:
                 break
         self._values = self._isam.calculateEstimate()

@@ -63,12 +63,12 @@ class Odometry:
         self._waiting: dict[int, tuple[int, StereoFrame, int]] = {}
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
+        self.seen_in: dict[int, int] = {}
+        """The last keyframe that saw a landmark."""
         self.observations: dict[int, int] = {}
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
-        self._last_seen: dict[int, int] = {}
-        """Newest keyframe in which each landmark was seen."""
         self.joint_covariance: Callable[[Sequence[int]], Float] | None = None
         """Of the running solver; None refuses every landmark that comes back from far away."""
 
@@ -135,7 +135,7 @@ class Odometry:
         """
         newest = self.last_keyframe
         ids = frame.track_ids
-        back = [r for r in rows if newest - self._last_seen.get(int(ids[r]), newest) >= AWAY]
+        back = [r for r in rows if newest - self.seen_in.get(int(ids[r]), newest) >= AWAY]
         living = sorted(set(rows) - set(back))
         kept, rejected, shift = self._gated_together(frame, living, pose)
         again, more, drift = self._gated_together(frame, back, pose)
@@ -239,7 +239,7 @@ class Odometry:
             record = Record(FAMILY, f"tracks {camera}", frame.stamp_ns, f"track {track} in {camera}", camera=camera)
             update.add(mobile_projection(camera, px, model, pose, point), record)
         self.observations[track] = self.observations.get(track, 0) + 1
-        self._last_seen[track] = max(index, self._last_seen.get(track, index))
+        self.seen_in[track] = max(index, self.seen_in.get(track, index))
 
     def _create(self, update: Update, frame: StereoFrame, rows: list[int], index: int, pose: gtsam.Pose3) -> None:
         """New landmarks from tracks seen in an earlier keyframe too; others wait for their second one."""

@@ -96,6 +96,7 @@ def calibration_truth(truth: Truth) -> dict[str, float]:
     """Calibration states by the names and in the units of `Result.calibration`."""
     rig = truth.rig
     values: dict[str, float] = {"depth_offset": rig.depth_offset_m, "depth_scale": rig.depth_scale}
+    values |= dict(zip(("depth_ray_x", "depth_ray_y", "depth_ray_scale"), map(float, rig.depth_rays), strict=True))
     values["baseline"] = float(np.linalg.norm(rig.m_left_T_m_right[:3, 3]))
     for name, camera in rig.cameras.items():
         values |= {f"{name}.fx": camera.K[0, 0], f"{name}.fy": camera.K[1, 1]}

@@ -10,15 +10,11 @@ import zenoh
 from ...factors.errors import LogError
 from ..schemas import typestore
 from .backoff import Backoff
-from .interfaces import LiveImage, LiveUpdate, OnCommand
+from .interfaces import Clock, LiveImage, LiveUpdate, OnCommand
 from .outbox import Outbox
 from .tally import Tally
 from .views import ros_messages
-from .zenoh_link import DEFAULT_ROUTER, Attachment, check_router, key_of, open_session
-
-_NODE = "surecut"
-_QOS = "::,1:,:,:,,"
-"""Reliable, volatile, keep the last: rmw_zenoh's spelling of the defaults with depth 1."""
+from .zenoh_link import DEFAULT_ROUTER, Announcements, Attachment, check_router, key_of, open_session
 
 
 class ZenohSink:
@@ -30,13 +26,15 @@ class ZenohSink:
         domain: ROS_DOMAIN_ID of the robot.
     """
 
-    def __init__(self, router: str = DEFAULT_ROUTER, *, domain: int = 0) -> None:
+    def __init__(self, router: str = DEFAULT_ROUTER, *, domain: int = 0, clock: Clock = time.time_ns) -> None:
         check_router(router)
         self._router = router
         self._domain = domain
+        self._clock = clock
         self._tally = Tally()
         self._outbox = Outbox("surecut-zenoh-sink", self._send, self._tally)
         self._session: zenoh.Session | None = None
+        self._announcements: Announcements | None = None
         self._publishers: dict[str, _Publisher] = {}
         self._stopping = threading.Event()
         self._linking: threading.Thread | None = None
@@ -77,8 +75,10 @@ class ZenohSink:
         backoff = Backoff()
         while self._session is None:
             try:
-                self._session, self._status = open_session(self._router), "connected"
-            except LogError as error:
+                session = open_session(self._router)
+                self._announcements = Announcements(session, self._domain)
+                self._session, self._status = session, "connected"
+            except (LogError, zenoh.ZError) as error:
                 self._status = str(error)
                 if backoff.wait(self._stopping):
                     return
@@ -90,39 +90,30 @@ class ZenohSink:
         session = self._session
         if not isinstance(item, LiveUpdate):
             return
-        if session is None or not self._linked():
+        if session is None or self._announcements is None or not self._linked():
             self._tally.add("dropped")
             return
         for topic, type_name, message in ros_messages(item):
             publisher = self._publishers.get(topic)
             if publisher is None:
-                publisher = _Publisher(session, self._domain, topic, type_name, len(self._publishers) + 1)
+                publisher = _Publisher(session, key_of(self._domain, topic, type_name))
+                self._announcements.publisher(topic, type_name)
                 self._publishers[topic] = publisher
-            publisher.put(bytes(typestore().serialize_cdr(message, type_name)))
+            publisher.put(bytes(typestore().serialize_cdr(message, type_name)), self._clock())
         self._tally.add("sent")
 
 
 class _Publisher:
-    """One topic, with what rmw_zenoh's subscribers ask for: an attachment per sample and a liveliness token."""
+    """One topic; rmw_zenoh's subscribers ask for an attachment with each sample."""
 
-    def __init__(self, session: zenoh.Session, domain: int, topic: str, type_name: str, number: int) -> None:
+    def __init__(self, session: zenoh.Session, key: str) -> None:
         self._publisher = session.declare_publisher(
-            key_of(domain, topic, type_name),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA,
+            key, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA
         )
-        self._token = session.liveliness().declare_token(_announcement(session, domain, topic, type_name, number))
         self._gid = os.urandom(16)
         self._sequence = 0
 
-    def put(self, data: bytes) -> None:
+    def put(self, data: bytes, now_ns: int) -> None:
         self._sequence += 1
-        attachment = Attachment(self._sequence, time.time_ns(), self._gid)
+        attachment = Attachment(self._sequence, now_ns, self._gid)
         self._publisher.put(data, attachment=attachment.encode())
-
-
-def _announcement(session: zenoh.Session, domain: int, topic: str, type_name: str, number: int) -> str:
-    """rmw_zenoh's liveliness key of a publisher."""
-    _, kind, digest = key_of(domain, topic, type_name).rsplit("/", 2)
-    mangled = topic.replace("/", "%")
-    return f"@ros2_lv/{domain}/{session.info.zid()}/0/{number}/MP/%/%/{_NODE}/{mangled}/{kind}/{digest}/{_QOS}"
