@@ -63,7 +63,7 @@ def advise(
         active: the factors of `system`, in its order.
         track_inflation: variance of the tracks' errors over what they state.
     """
-    if not points or not values.exists(keys.base(0)):
+    if not points or not values.exists(engine.base):
         return {}
     planner = Planner(Surroundings(engine, values, active), track_inflation)
     plans = list(planner.plans([p.id for p in points]))
@@ -178,7 +178,7 @@ class Planner:
         told: dict[str, list[Advice]] = {}
         action = "Average more Kinect images"
         detail = f"{MORE_FRAMES} times as many while the machine stands still"
-        blocks = {p.id: point_blocks(self.scene.values, keys.base(0), self._key(p.id))[1] for p in points}
+        blocks = {p.id: point_blocks(self.scene.values, self.scene.engine.base, self._key(p.id))[1] for p in points}
         stacked = _stacked([blocks[p.id] for p in points])
         covariance = measured_again(system, rows, gain, stacked)
         for i, p in enumerate(points):
@@ -195,7 +195,7 @@ def _predict(
 ) -> dict[str, list[Advice]]:
     """The best plan of each kind for each point."""
     values, engine = planner.scene.values, planner.scene.engine
-    blocks = {p.id: point_blocks(values, keys.base(0), keys.point(engine.pipes.points[p.id].index))[1] for p in points}
+    blocks = {p.id: point_blocks(values, engine.base, keys.point(engine.pipes.points[p.id].index))[1] for p in points}
     touched = {key for block in blocks.values() for key, _ in block}
     touched |= {int(key) for plan in plans for p in plan.factors for key in p.factor.keys()}
     joint = Joint.of(system, sorted(touched & set(system.columns)))

@@ -118,12 +118,12 @@ def mount_again(scene: Surroundings) -> list[Predicted]:
             "rotation_sigma_rad": mount.rotation_sigma_rad / np.sqrt(3.0),
         }
     )
-    return [Predicted(mount_factor(better, scene.engine.boards.key(mount.board), keys.base(0)))]
+    return [Predicted(mount_factor(better, scene.engine.boards.key(mount.board), scene.engine.base))]
 
 
 def colour_camera(scene: Surroundings) -> tuple[gtsam.Pose3, gtsam.Cal3DS2]:
     """`o_T_rgb` and the pinhole of the Kinect's colour camera, from the estimate or from what was given."""
-    values, o_T_b = scene.values, scene.values.atPose3(keys.base(0))
+    values, o_T_b = scene.values, scene.values.atPose3(scene.engine.base)
     if values.exists(keys.intrinsics("b_rgb")):
         return o_T_b.compose(values.atPose3(keys.extrinsics("b_rgb"))), values.atCal3DS2(keys.intrinsics("b_rgb"))
     return o_T_b.compose(rgb_mean(scene.engine.rig.kinect)), cal3(scene.engine.cameras["b_rgb"])
@@ -164,7 +164,7 @@ def second_board(
             point, place = keys.corner(slot, i), o_T_f.transformFrom(corner)
             new.insert(point, place)
             px = K @ o_T_rgb.transformTo(place)
-            found.append(Predicted(machine_projection(px[:2] / px[2], colour, keys.base(0), point)))
+            found.append(Predicted(machine_projection(px[:2] / px[2], colour, scene.engine.base, point)))
             for camera in ("m_left", "m_right"):
                 seen, inside = scene.pixels(camera, view.o_T_m, place[None])
                 sigma = scene.sigma(CORNERS, camera, float(np.hypot(CORNER_SIGMA_PX, common)))

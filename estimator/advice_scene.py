@@ -77,7 +77,7 @@ class Surroundings:
 
     def _all_points(self) -> Float:
         """Everything mapped, in {o}: landmarks and the Kinect's surface."""
-        cloud, base = self.engine.surfaces.cloud, keys.base(0)
+        cloud, base = self.engine.surfaces.cloud, self.engine.base
         if cloud is None or not self.values.exists(base) or not self.values.exists(keys.DEPTH):
             return self.points
         o_T_b = self.values.atPose3(base)

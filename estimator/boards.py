@@ -272,6 +272,18 @@ class Boards:
         for view in views:
             self._observe(sheet, view.keyframe, None, view.seen, update)
 
+    def carried(self) -> list[tuple[int, int]]:
+        """The machine has been moved: boards on it go on with new poses and corners; (old, new) keys of the poses."""
+        pairs = []
+        for sheet in self.sheets.values():
+            if sheet.board.attached_to == "b" and sheet.known:
+                self._forget(sheet, sheet.displaced)
+                old = sheet.key
+                sheet.epoch += 1
+                sheet.slots = {}
+                pairs.append((old, sheet.key))
+        return pairs
+
     # Corners --------------------------------------------------------------------------------------------------
 
     def _observe(

@@ -3,7 +3,15 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
+from ..factors.measurements import (
+    BaseMove,
+    CloudFrame,
+    CylinderSighting,
+    MarkerSighting,
+    OutlineSighting,
+    Pick,
+    StereoFrame,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +26,8 @@ class Bundle:
     """Surface depth and its sigma under the picks of this stamp, by point id, where it could be measured."""
     outlines: tuple[OutlineSighting, ...] = ()
     cloud: CloudFrame | None = None
+    moved: BaseMove | None = None
+    """The machine stands elsewhere since before this stamp."""
     cylinders: tuple[CylinderSighting, ...] = ()
     """Pipes in the cloud, where they were looked for elsewhere."""
 
@@ -43,5 +53,6 @@ def _bundle(stamp_ns: int, group: list[object]) -> Bundle:
         {},
         of(OutlineSighting),
         clouds[0] if clouds else None,
+        next(iter(of(BaseMove)), None),
         of(CylinderSighting),
     )

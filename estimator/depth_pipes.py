@@ -1,6 +1,6 @@
 """Pipes in the Kinect's cloud: where to look for them, and what was found as one summarised factor per station."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -72,8 +72,8 @@ class DepthPipes:
             and self._state.has(keys.DEPTH)
         ]
 
-    def predict(self, pipe: str, base: int, solver: Incremental) -> PredictedPipe | None:
-        """Where a pipe is in {b}, as the Kinect measures it; None while that is hardly known."""
+    def place(self, pipe: str, base: int) -> PredictedPipe | None:
+        """Where a pipe is in {b}, as the Kinect measures it, as unsure as may be; None where no pipe can be seen."""
         axis, places = self._pipes.axis(pipe), self._pipes.places(pipe)
         if axis is None:
             return None
@@ -88,10 +88,13 @@ class DepthPipes:
             if b_p[2] < 0.2:
                 return None
             ends.append(corrected(b_p[None], -offset, -scale, -self._state.vector(keys.DEPTH_RAYS))[0])
-        predicted = PredictedPipe(ends[0], ends[1], radius, 0.0)
-        spread = self._spread(predicted, self._pipes.cylinders[pipe].index, base, solver)
+        return PredictedPipe(ends[0], ends[1], radius, MOST_SIGMA_M)
+
+    def narrowed(self, placed: PredictedPipe, pipe: str, base: int, solver: Incremental) -> PredictedPipe | None:
+        """The same with the sigma that the state's covariance gives; None while its place is hardly known."""
+        spread = self._spread(placed, self._pipes.cylinders[pipe].index, base, solver)
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(spread[i : i + 2, i : i + 2])[-1] for i in (0, 2))))
-        return PredictedPipe(ends[0], ends[1], radius, sigma) if sigma < MOST_SIGMA_M else None
+        return replace(placed, sigma_m=sigma) if sigma < MOST_SIGMA_M else None
 
     def _spread(self, predicted: PredictedPipe, index: int, base: int, solver: Incremental) -> Float:
         """Covariance (5, 5) of what `cylinder_factor` compares, from the state alone."""

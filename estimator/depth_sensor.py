@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
-from ..factors.measurements import CloudFrame
+from ..factors.geometry import pose3
+from ..factors.measurements import BaseMove, CloudFrame
 from ..factors.rig import Kinect
+from ..frontends.cloud.base_motion import BaseMotion
 from ..frontends.cloud.frontend import CloudFrontEnd, average_depth
 from ..frontends.cloud.noise import DepthModel
 from ..frontends.cloud.points import cloud_from_points
@@ -19,6 +21,10 @@ DEPTH_FRAMES = 10
 WINDOW_NS = 2_000_000_000
 """Depth images of a still machine that are averaged before surfaces are read from them: so many, or so long."""
 
+WATCH_NS = 180_000_000
+"""Between depth images in which motion of the machine is looked for."""
+FEWEST_SAMPLES = 200
+"""A depth image with fewer surface samples, such as a covered one, tells nothing about motion."""
 CLOUD_POINTS = 100_000
 """Larger clouds are thinned out: their neighbours tell nothing of their own."""
 
@@ -34,6 +40,8 @@ class DepthView:
     """Shape (n, 3), in the depth optical frame, where only clouds come."""
     colour: NDArray[np.uint8] | None = None
     """The colour image beside it, grey."""
+    moved: BaseMove | None = None
+    """The machine has been moved since the last view."""
 
 
 class DepthSensor:
@@ -44,17 +52,45 @@ class DepthSensor:
         self._clouds: CloudFrontEnd | None = None
         self._waiting: list[tuple[int, Depth]] = []
         self._last_cloud_ns: int | None = None
+        self._motion = BaseMotion()
+        self._watched_ns: int | None = None
+        self._move: BaseMove | None = None
 
     def image(self, stamp_ns: int, depth_m: Depth, camera: CameraModel) -> DepthView | None:
         """The mean of the last depth images and its surfaces, once enough have gathered."""
         if self._clouds is None:
             self._clouds = CloudFrontEnd(camera, self._model)
+        self._watch(stamp_ns, depth_m)
+        if self._motion.restless:
+            self._waiting.clear()
+            return None
         self._waiting.append((stamp_ns, depth_m))
         if len(self._waiting) < DEPTH_FRAMES and stamp_ns - self._waiting[0][0] < WINDOW_NS:
             return None
         mean, count = average_depth(np.stack([depth for _, depth in self._waiting])), len(self._waiting)
         self._waiting.clear()
-        return DepthView(self._clouds.process(stamp_ns, mean, count), depth_m=mean)
+        move, self._move = self._move, None
+        return DepthView(self._clouds.process(stamp_ns, mean, count), depth_m=mean, moved=move)
+
+    def _watch(self, stamp_ns: int, depth_m: Depth) -> None:
+        """Does the machine still stand where it stood?"""
+        assert self._clouds is not None
+        if self._watched_ns is not None and stamp_ns - self._watched_ns < WATCH_NS:
+            return
+        self._watched_ns = stamp_ns
+        cloud = self._clouds.process(stamp_ns, depth_m)
+        station = self._motion.add(cloud) if len(cloud.points_m) >= FEWEST_SAMPLES else None
+        if station is None or station.previous_T_this is None:
+            return
+        link, before = station.previous_T_this, self._motion.stations[station.index - 1]
+        start_ns = before.start_ns if before.end_ns is None else before.end_ns
+        pose, covariance = link.a_T_b, link.covariance
+        if self._move is not None:
+            # Nothing was seen from the station between: one move, the uncertainties in a row.
+            turn = pose3(pose).inverse().AdjointMap()
+            covariance = covariance + turn @ self._move.covariance @ turn.T
+            pose, start_ns = self._move.before_T_after @ pose, self._move.start_ns
+        self._move = BaseMove(start_ns, station.start_ns, pose, covariance)
 
     def cloud(self, stamp_ns: int, points_m: Float) -> DepthView:
         """A cloud (n, 3) in the depth optical frame and its surfaces."""

@@ -26,6 +26,7 @@ from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose, weak_pose_prior
 from ..factors.measurements import (
+    BaseMove,
     CylinderSighting,
     Event,
     MarkerSighting,
@@ -49,6 +50,7 @@ from .odometry import FAMILY as ODOMETRY
 from .odometry import FramePose, Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .placement import place
+from .stations import Stations, move_event
 from .surfaces import Associator, Surfaces, SurfaceSettings
 
 Float = NDArray[np.float64]
@@ -81,6 +83,7 @@ class Engine:
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
         self.odometry.joint_covariance = self.solver.joint_covariance
         self.boards = Boards(rig, self.state)
+        self.stations = Stations(self.state)
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
@@ -109,13 +112,15 @@ class Engine:
     @property
     def base(self) -> int:
         """Key of `o_T_b` of the present station."""
-        return keys.base(0)
+        return self.stations.base
 
     # The loop -------------------------------------------------------------------------------------------------
 
     def add(self, bundle: Bundle) -> bool:
         """Takes one stamp's measurements; True when the estimate has changed."""
         self.end_ns = max(self.end_ns, bundle.stamp_ns)
+        if bundle.moved is not None:
+            self._move_base(bundle.moved)
         self._open_calibration(bundle)
         if bundle.frame is not None:
             self._follow(bundle.frame)
@@ -305,7 +310,7 @@ class Engine:
     def _open_base(self, stamp_ns: int) -> None:
         """{b} enters through the mount when its board is known."""
         mount = self.rig.mount
-        base = keys.base(0)
+        base = self.base
         if mount is None or self._mounted or not self.boards.known(mount.board):
             return
         self._mounted = True
@@ -334,9 +339,19 @@ class Engine:
         self.events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
         self.flush()
 
+    def _move_base(self, move: BaseMove) -> None:
+        """The machine stands elsewhere now: a new {b}, and the landmarks are laid on what it sees from there."""
+        self.flush()
+        self._colour = []
+        self._take(self.stations.move(move, self.boards))
+        self._mounted = self._mounted and self.state.has(self.base)
+        self.surfaces.restart()
+        self.events.append(move_event(move))
+        self.flush()
+
     def _see_from_machine(self) -> None:
         """Boards in the machine's colour images tie {b} to them directly, and may give it its first place."""
-        base, extrinsics = keys.base(0), keys.extrinsics("b_rgb")
+        base, extrinsics = self.base, keys.extrinsics("b_rgb")
         if not self._colour or not (self.state.has(base) or self._base_by_view()):
             return
         waiting, self._colour = self._colour, []
@@ -359,7 +374,7 @@ class Engine:
                 continue
             update = Update()
             b_T_rgb = self.state.pose(keys.extrinsics("b_rgb"))
-            update.guess(keys.base(0), pose3(found[0]).compose(b_T_rgb.inverse()))
+            update.guess(self.base, pose3(found[0]).compose(b_T_rgb.inverse()))
             self._take(update)
             return True
         return False
@@ -388,19 +403,19 @@ class Engine:
         return [keys.corner(slot, i) for i in corners]
 
     def _lay_landmarks(self, index: int) -> None:
-        if self.state.has(keys.base(0)) and self.state.has(keys.DEPTH):
+        if self.state.has(self.base) and self.state.has(keys.DEPTH):
             camera = self.state.pose(keys.keyframe(index))
-            self._take(self.surfaces.lay(keys.base(0), camera, self.odometry.observations))
+            self._take(self.surfaces.lay(self.base, camera, self.odometry.observations))
 
     # Picks and pipes ------------------------------------------------------------------------------------------
 
     def seen_from(self, camera: str, stamp_ns: int) -> SeenFrom | None:
         """The pose that a camera's pixels at a stamp hang on, None when there is no keyframe."""
         if camera == "b_rgb":
-            if not self.state.has(keys.base(0)):
+            base = self.stations.at(stamp_ns)
+            if base is None or not self.state.has(base):
                 return None
-            pose = self.state.pose(keys.base(0)).compose(self.state.pose(keys.extrinsics("b_rgb")))
-            return SeenFrom(keys.base(0), pose)
+            return SeenFrom(base, self.state.pose(base).compose(self.state.pose(keys.extrinsics("b_rgb"))))
         index = self.keyframe_at.get(stamp_ns)
         if index is None:
             return None

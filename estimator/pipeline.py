@@ -40,7 +40,7 @@ class Pipeline:
             self._outlines.see(sensed.pair, sensed.bundle.picks)
             self._base.see(sensed.pair)
         if sensed.depth is not None:
-            engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud))
+            engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud, moved=sensed.depth.moved))
             self._depths.see(sensed.depth)
             self._base.search(sensed.depth)
 

@@ -17,6 +17,14 @@ Float = NDArray[np.float64]
 Blocks = list[tuple[int, Float]]
 
 
+def present_base(values: gtsam.Values) -> int:
+    """Key of `o_T_b` of the last station."""
+    station = 0
+    while values.exists(keys.base(station + 1)):
+        station += 1
+    return keys.base(station)
+
+
 def point_blocks(values: gtsam.Values, base: int, point: int) -> tuple[Float, Blocks]:
     """`b_p = o_T_b^-1 o_p` and its Jacobians."""
     b_p, d_pose, d_point = point_to_frame(values.atPose3(base), values.atPoint3(point))

@@ -109,7 +109,7 @@ class Summary:
     # Points ---------------------------------------------------------------------------------------------------
 
     def _points(self) -> tuple[PointEstimate, ...]:
-        engine, base = self._engine, keys.base(0)
+        engine, base = self._engine, self._engine.base
         known = [p for p in engine.pipes.points.values() if p.known]
         if known and not self._values.exists(base):
             raise ObservabilityError(engine.why_no_base())
@@ -117,7 +117,7 @@ class Summary:
 
     def _point(self, name: str) -> PointEstimate:
         point = self._engine.pipes.points[name]
-        position, blocks = point_blocks(self._values, keys.base(0), keys.point(point.index))
+        position, blocks = point_blocks(self._values, self._engine.base, keys.point(point.index))
         influence = self._system.influence(blocks)
         covariance = influence.T @ influence
         axis = None
@@ -126,7 +126,7 @@ class Summary:
         return PointEstimate(
             id=point.id,
             role=point.role,
-            frame="b",
+            frame=self._engine.stations.frame,
             position_m=position,
             covariance_m2=covariance,
             radius95_m=radius95(covariance),
@@ -147,7 +147,7 @@ class Summary:
         return replace(point, nearest_surface=nearest_surface(around, point, own, key, self._values, self._system))
 
     def _axis(self, index: int) -> Float:
-        o_T_b = self._values.atPose3(keys.base(0))
+        o_T_b = self._values.atPose3(self._engine.base)
         span = self._values.atPoint3(keys.axis_end(index)) - self._values.atPoint3(keys.axis_start(index))
         return o_T_b.rotation().matrix().T @ (span / np.linalg.norm(span))
 
@@ -164,11 +164,21 @@ class Summary:
     def _pipes(self, points: tuple[PointEstimate, ...]) -> tuple[PipeEstimate, ...]:
         found = []
         for name, cylinder in self._engine.pipes.cylinders.items():
-            if not cylinder.known or not self._values.exists(keys.base(0)):
+            if not cylinder.known or not self._values.exists(self._engine.base):
                 continue
             on_it = [p.position_m for p in points if p.pipe_id == name]
             near = np.mean(on_it, axis=0) if on_it else np.zeros(3)
-            found.append(pipe_estimate(name, "b", cylinder.index, keys.base(0), near, self._values, self._system))
+            found.append(
+                pipe_estimate(
+                    name,
+                    self._engine.stations.frame,
+                    cylinder.index,
+                    self._engine.base,
+                    near,
+                    self._values,
+                    self._system,
+                )
+            )
         return tuple(found)
 
     # Poses ----------------------------------------------------------------------------------------------------
@@ -176,8 +186,11 @@ class Summary:
     def _poses(self) -> tuple[PoseEstimate, ...]:
         engine = self._engine
         named = []
-        if self._values.exists(keys.base(0)):
-            named.append(("b", keys.base(0), engine.end_ns))
+        if self._values.exists(self._engine.base):
+            named.append(("b", engine.base, engine.end_ns))
+        for station, move in enumerate(engine.stations.moves):
+            if self._values.exists(keys.base(station)):
+                named.append((f"b{station}", keys.base(station), move.start_ns))
         for board in engine.rig.boards:
             if engine.boards.known(board.id):
                 named.append((board.id, engine.boards.key(board.id), engine.end_ns))

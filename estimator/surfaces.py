@@ -69,6 +69,12 @@ class Surfaces:
         """The newest cloud of a machine that stands still replaces the last one."""
         self.cloud = cloud
 
+    def restart(self) -> None:
+        """The machine stands elsewhere: its old cloud is of no use, and every landmark may be laid again."""
+        self.cloud = None
+        self._tried.clear()
+        self._laid.clear()
+
     def lay(self, base: int, camera: gtsam.Pose3, observations: dict[int, int]) -> Update:
         """Plane factors for landmarks that were not laid yet.
 

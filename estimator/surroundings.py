@@ -11,7 +11,7 @@ from ..factors import keys
 from ..factors.cloud import corrected, depth_moves, depth_states
 from .engine import Engine
 from .linear import LinearSystem
-from .points_in_base import point_blocks
+from .points_in_base import point_blocks, present_base
 from .result import NearestSurface, PipeEstimate, PointEstimate, SurfaceMap
 
 Float = NDArray[np.float64]
@@ -46,7 +46,7 @@ class Surroundings:
 
 def surroundings(engine: Engine, values: gtsam.Values, system: LinearSystem) -> Surroundings | None:
     """The map of a solved run; None where {b} is not known."""
-    base = keys.base(0)
+    base = engine.base
     if not values.exists(base):
         return None
     o_T_b = values.atPose3(base)
@@ -168,12 +168,12 @@ def _distance_sigma(
 ) -> float:
     """Sigma of the distance from the joint of the point and what is next to it."""
     if row < len(found.landmarks):
-        base = values.atPose3(keys.base(0))
+        base = values.atPose3(present_base(values))
         o_unit = base.rotation().matrix() @ unit
         blocks = [(found.landmarks[row], o_unit[None]), (key, -o_unit[None])]
         return float(np.sqrt(system.covariance(blocks)[0, 0]))
     measured = found.measured_m[row - len(found.landmarks)]
-    _, of_point = point_blocks(values, keys.base(0), key)
+    _, of_point = point_blocks(values, present_base(values), key)
     depth = unit[None] @ depth_moves(measured[None])[0]
     blocks = [(k, -unit[None] @ J) for k, J in of_point]
     blocks += [(keys.DEPTH, depth[:, :2]), (keys.DEPTH_RAYS, depth[:, 2:])]

@@ -55,3 +55,27 @@ def weak_pose_prior(key: int, pose: gtsam.Pose3, sigma_rad: float, sigma_m: floa
 def base_motion_factor(earlier: int, later: int, a_T_b: np.ndarray, covariance: np.ndarray) -> gtsam.NonlinearFactor:
     """The machine between two stations, `b[j]_T_b[j+1]`; covariance (6, 6) rotation first, body frame of the later."""
     return gtsam.BetweenFactorPose3(earlier, later, gtsam.Pose3(a_T_b), gaussian(covariance))
+
+
+CARRIED_RAD, CARRIED_M = 2e-4, 2e-4
+"""How exactly a board that is screwed to the machine keeps its place on it, from station to station."""
+
+
+def carried_factor(base: int, board: int, later_base: int, later_board: int) -> gtsam.CustomFactor:
+    """A board on the machine keeps its place in {b}: `(b^-1 f)^-1 (b'^-1 f')` is the identity; residual (6,)."""
+    variables = [base, board, later_base, later_board]
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        b, f, b2, f2 = (values.atPose3(key) for key in variables)
+        then, now = b.between(f), b2.between(f2)
+        moved = then.between(now)
+        if jacobians is not None:
+            back = moved.inverse().AdjointMap()
+            outer = gtsam.Pose3.LogmapDerivative(moved)
+            jacobians[0] = outer @ back @ then.inverse().AdjointMap()
+            jacobians[1] = -outer @ back
+            jacobians[2] = -outer @ now.inverse().AdjointMap()
+            jacobians[3] = outer
+        return gtsam.Pose3.Logmap(moved)
+
+    return gtsam.CustomFactor(pose_sigmas(CARRIED_RAD, CARRIED_M), variables, error)

@@ -33,8 +33,8 @@ class MarkerSighting:
     raw_px: Float
     """Shape (4, 2), as found in the image, for drawing."""
     common_px: float | None = None
-    """Sigma of the part of it that views from the same place have in common; None: not known, so that the rig's
-    `marker_common_px` comes on top of the covariance."""
+    """Sigma of the part of it that views from the same place have in common, where the front end knows; the rig's
+    `marker_common_px` is the least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +147,20 @@ class OutlineSighting:
     """Shape (2,), the pick, or the predicted middle of the outline, that the search began at."""
     quality: float
     """Probability that no other pair of edges is the outline, by the search's own score (0 to 1)."""
+
+
+@dataclass(frozen=True, slots=True)
+class BaseMove:
+    """The machine was moved from one station to the next."""
+
+    start_ns: int
+    """When it began to move."""
+    stamp_ns: int
+    """Since when it has stood again."""
+    before_T_after: Float
+    """Shape (4, 4), pose of the new {b} in the old one."""
+    covariance: Float
+    """Shape (6, 6), rotation first, body frame of the new {b}; wide where the clouds do not hold it."""
 
 
 @dataclass(frozen=True, slots=True)

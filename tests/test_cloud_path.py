@@ -142,7 +142,7 @@ def test_a_camera_is_found_among_stereo_features():
 @pytest.fixture(scope="module")
 def run():
     # no panel: Kinect and mobile camera see the same walls
-    return draw(Scenario(panel=False, tracks=Tracks(per_frame=250), clouds=Clouds(points=8000)), 5)
+    return draw(Scenario(panel=False, tracks=Tracks(per_frame=180), clouds=Clouds(points=8000)), 5)
 
 
 def estimator(run, rig):

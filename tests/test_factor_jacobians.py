@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from surecut.factors import board, cloud, keys, pipe
+from surecut.factors import board, cloud, keys, links, pipe
 from surecut.factors.measurements import CylinderSighting
 from surecut.factors.noise import gaussian, sigmas
 from surecut.factors.rig import Board, Marker
@@ -198,3 +198,16 @@ def test_a_cylinder_seen_too_far_by_the_depth_offset():
     np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-12)
     values.update(keys.DEPTH, np.zeros(2))
     assert np.linalg.norm(factor.unwhitenedError(values)) == pytest.approx(0.02 * np.sqrt(2), rel=1e-6)
+
+
+def test_carried_factor():
+    values = gtsam.Values()
+    b_T_f, before, after = (a_pose() for _ in range(3))
+    values.insert(keys.base(0), before)
+    values.insert(keys.board(0, 0), before.compose(b_T_f).retract(RNG.normal(0, 0.01, 6)))
+    values.insert(keys.base(1), after)
+    values.insert(keys.board(0, 1), after.compose(b_T_f))
+    factor = links.carried_factor(keys.base(0), keys.board(0, 0), keys.base(1), keys.board(0, 1))
+    check(factor, values, whitener(factor.noiseModel()))
+    values.update(keys.board(0, 0), before.compose(b_T_f))
+    np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-9)

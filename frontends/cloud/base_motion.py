@@ -71,6 +71,11 @@ class BaseMotion:
         """True between two stations."""
         return self._moving is not None
 
+    @property
+    def restless(self) -> bool:
+        """True while the base moves, and from the first frame that looks like it."""
+        return self._moving is not None or bool(self._restless)
+
     def add(self, cloud: CloudFrame) -> Station | None:
         """Takes the next cloud; returns a station when one has just begun."""
         if self._reference is None:

@@ -17,6 +17,8 @@ from .segment import cylinder_sighting
 
 Float = NDArray[np.float64]
 
+FEWEST_POINTS = 20
+"""Near the predicted pipe, for a search."""
 LEAST_REACH_M = 0.06
 """The search goes so far beyond the predicted surface at least: a mount that is off has to show, not to hide."""
 GATE_SIGMA = 3.0
@@ -108,8 +110,9 @@ def cylinder_near(
     """
     what = f"b_depth {pipe_id}"
     points = points_m[pipe.near(points_m)]
-    if len(points) < 20:
-        return Rejection(stamp_ns, "pipe cylinder", what, "few points near the predicted pipe", len(points), 20.0)
+    if len(points) < FEWEST_POINTS:
+        few = "few points near the predicted pipe"
+        return Rejection(stamp_ns, "pipe cylinder", what, few, len(points), FEWEST_POINTS)
     noise = depth_noise(model)
     fit: CylinderFit | Rejection | None = None
     for start in (_moved_to(points, pipe), None):
