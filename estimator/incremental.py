@@ -100,7 +100,9 @@ class Incremental:
         """Starts iSAM2 anew from a damped batch optimum.
 
         A linearisation far from the optimum can be singular although the problem is not: new landmarks and axes start
-        from rough guesses. Levenberg-Marquardt gets across; what stays singular there is not observable.
+        from rough guesses. Levenberg-Marquardt gets across. And what hangs on a motion prior of a metre is held a
+        billion times less than what its landmarks hold, of which Cholesky's squares leave nothing: from here on it is
+        QR. What is singular for both is not observable.
         """
         graph = gtsam.NonlinearFactorGraph()
         self._slots = []
@@ -112,7 +114,7 @@ class Incremental:
         optimiser = gtsam.LevenbergMarquardtOptimizer(graph, self._values, gtsam.LevenbergMarquardtParams())
         with determined():
             values = optimiser.optimize()
-            self._isam = gtsam.ISAM2(_parameters())
+            self._isam = gtsam.ISAM2(_parameters("QR"))
             self._isam.update(graph, values)
         self._values = self._isam.calculateEstimate()
 
@@ -137,8 +139,9 @@ class Incremental:
         return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
-def _parameters() -> gtsam.ISAM2Params:
+def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:
     parameters = gtsam.ISAM2Params()
+    parameters.setFactorization(factorisation)
     thresholds = gtsam.ISAM2ThresholdMap()
     for letter, values in _THRESHOLDS.items():
         thresholds.insert((letter, np.array(values)))

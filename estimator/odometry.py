@@ -102,6 +102,8 @@ class Odometry:
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self._create(update, frame, new, index, pose)
+        if len(known) < self._settings.minimum_shared:
+            self._create_from_before(update, frame, index, pose)
         self.keyframe_stamps.append(frame.stamp_ns)
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
@@ -174,6 +176,12 @@ class Odometry:
     def _residuals(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[Float, NDArray[np.bool_]]:
         """Left pixels less those of the landmarks seen from a pose, (n, 2), and which are ahead of the camera."""
         points = np.array([self._state.point(keys.landmark(int(frame.track_ids[r]))) for r in rows])
+        return self._residuals_of(frame, rows, points, pose)
+
+    def _residuals_of(
+        self, frame: StereoFrame, rows: list[int], points: Float, pose: gtsam.Pose3
+    ) -> tuple[Float, NDArray[np.bool_]]:
+        """The same for points (n, 3) in {o}."""
         K = self._state.intrinsics(keys.intrinsics("m_left")).K()
         c_p = (points - pose.translation()) @ pose.rotation().matrix()
         front = c_p[:, 2] > 0.05
@@ -254,6 +262,38 @@ class Odometry:
                 self._waiting[track] = (index, frame, r)
         alive = {int(t) for t in frame.track_ids}
         self._waiting = {t: w for t, w in self._waiting.items() if t in alive or index - w[0] < 3}
+
+    def _create_from_before(self, update: Update, frame: StereoFrame, index: int, pose: gtsam.Pose3) -> None:
+        """Landmarks from tracks that only the left image shows now: the keyframe that they wait in has seen both.
+
+        A click makes a keyframe of any frame. Where no landmark holds it yet, these do.
+        """
+        rows = [
+            r
+            for r, track in enumerate(frame.track_ids.tolist())
+            if track in self._waiting and not np.isfinite(frame.right_px[r, 0]) and self._waiting[track][0] < index
+        ]
+        made: list[tuple[int, Float]] = []
+        for r in rows:
+            first_index, first, first_row = self._waiting[int(frame.track_ids[r])]
+            c_p = self._triangulate(first, [first_row])[0]
+            if c_p is not None:
+                made.append((r, self._state.pose(keys.keyframe(first_index)).transformFrom(c_p)))
+        if not made:
+            return
+        rows = [r for r, _ in made]
+        residual, front = self._residuals_of(frame, rows, np.array([o_p for _, o_p in made]), pose)
+        distance = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
+        limit = max(self._settings.gate_sigma * 1.4826 * float(np.median(distance)), self._settings.gate_px)
+        good = [i for i in range(len(rows)) if front[i] and distance[i] < limit]
+        chosen = set(_spread(frame.left_px, [rows[i] for i in good], self._settings.tracks_per_keyframe))
+        for r, o_p in made:
+            if r in chosen:
+                track = int(frame.track_ids[r])
+                first_index, first, first_row = self._waiting.pop(track)
+                update.guess(keys.landmark(track), o_p)
+                self._observe(update, first, first_row, first_index)
+                self._observe(update, frame, r, index)
 
     def _agreeing(self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3) -> set[int]:
         """Rows whose point, triangulated now, is also where the earlier keyframe saw it, left and right.

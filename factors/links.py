@@ -9,6 +9,8 @@ from .rig import Mount
 
 GAUGE_ROTATION_RAD = 1e-7
 GAUGE_TRANSLATION_M = 1e-7
+LARGEST_TURN_RAD = 1.0
+"""Sigma beyond which a rotation is unknown anyhow, and its tangent means nothing."""
 
 
 def gauge_prior(keyframe: int) -> gtsam.NonlinearFactor:
@@ -40,7 +42,7 @@ def motion_prior(
     Args:
         speed_m_s, turn_rad_s: standard deviation of the velocity that the guess does not know.
     """
-    rotation = max(turn_rad_s * seconds, 1e-3)
+    rotation = float(np.clip(turn_rad_s * seconds, 1e-3, LARGEST_TURN_RAD))
     translation = max(speed_m_s * seconds, 1e-3)
     return gtsam.BetweenFactorPose3(earlier, later, motion, pose_sigmas(rotation, translation))
 

@@ -13,6 +13,7 @@ from surecut.frontends.stereo.keyframes import keyframe_reason
 from surecut.frontends.stereo.matching import search_right
 from surecut.frontends.stereo.motion import estimate_motion, point_covariance
 from surecut.frontends.stereo.settings import StereoSettings
+from surecut.frontends.stereo.warp import warp_offsets
 
 
 def rig(left_T=None):
@@ -160,3 +161,15 @@ def test_grey_from_any_image():
 
 def test_projection_behind_the_camera_is_nan():
     assert np.isnan(project(np.array([[0.0, 0.0, -1.0]]), camera())).all()
+
+
+def test_a_turned_patch_fits_beside_its_centre():
+    """Turned by theta about the vertical, u / f = tan(phi + theta): half its curvature times the weights' moment."""
+    theta, moment = 0.3, 15.0
+    turn = np.eye(4)
+    turn[:3, :3] = [[np.cos(theta), 0, np.sin(theta)], [0, 1, 0], [-np.sin(theta), 0, np.cos(theta)]]
+    left, _ = warp_offsets(np.array([[0.0, 0.0, 2.0]]), turn[None], rig(), moment)
+    expected = moment * np.sin(theta) / np.cos(theta) ** 3 / K[0, 0]
+    assert left[0] == pytest.approx([expected, 0.0], rel=0.01, abs=1e-6)
+    unknown = warp_offsets(np.full((1, 3), np.nan), turn[None], rig(), moment)
+    assert not np.any(unknown)

@@ -73,6 +73,10 @@ class Alignment:
     converged: Bool
     """Shape (n,)."""
 
+    def moved(self, offset: Float) -> "Alignment":
+        """The same at places moved by `offset` (n, 2)."""
+        return Alignment(self.px + offset, self.correlation, self.covariance, self.converged)
+
     def take(self, index: NDArray[np.intp] | Bool) -> "Alignment":
         """Those at the given indices or of the given mask."""
         return Alignment(self.px[index], self.correlation[index], self.covariance[index], self.converged[index])
@@ -95,6 +99,8 @@ class PatchGrid:
         weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Shape (m,). Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
+        self.moment_px2 = float((self.offsets[:, 0] ** 2) @ self.weights)
+        """Second moment of the weights along either axis."""
         self._stiffness = float((self.weights**2).sum()) / bend_sigma**2 if self.affine else 0.0
         self._basis = np.concatenate((np.ones((1, len(self.offsets))), self.offsets.T)).astype(np.float32)
         """Shape (3, m): one, and the offsets in u and v."""

@@ -15,7 +15,7 @@ from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
 from .images import Float32, smooth
 from .tracks import CROP_SIDE, Int, Tracks
-from .warp import linear_warps
+from .warp import linear_warps, warp_offsets
 
 Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
@@ -142,12 +142,13 @@ class LandmarkStore:
         tiles, centres = _mosaic(self.tiles[rows])
         this_T_patch = inverse(chain_T_this) @ self.patch_poses[rows]
         warp = linear_warps(self.patch_points[rows], this_T_patch, rig)[0]
+        off = warp_offsets(self.patch_points[rows], this_T_patch, rig, grid.moment_px2)[0]
         # Each tile is low-passed by itself: the mosaic's seams lie beyond the coarse patch.
         coarse = make_patches(_low_pass(tiles), centres, _COARSE_GRID)
         first = align(smooth(image, _COARSE_SMOOTHING_PX), coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
         fine = make_patches(tiles, centres, grid, variance)
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
-        second = align(smoothed, fine, start, warp, grid, 10)
+        second = align(smoothed, fine, start, warp, grid, 10).moved(-off)
         return second, fine, second.converged & (second.correlation > min_correlation)
 
     def revive(self, rows: NDArray[np.intp], raw_px: Float, ideal_px: Float, patches: Patches, points: Float) -> Tracks:

@@ -16,7 +16,7 @@ from .pair import StereoPair
 from .settings import StereoSettings
 from .sighting import Sighting
 from .tracks import Int, Tracks, new_tracks
-from .warp import linear_warps
+from .warp import linear_warps, warp_offsets
 
 Bool = NDArray[np.bool_]
 
@@ -66,21 +66,27 @@ class Observer:
         Returns:
             the sighting, refined left raw pixels (n, 2), and which tracks were seen in the left image (n,).
         """
-        warps = linear_warps(tracks.patch_points, inverse(chain_T_this) @ tracks.patch_poses, self._rig)
-        left = align(view.left, tracks.patches, tracks.raw_px, warps[0], self.grid)
+        this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
+        warps = linear_warps(tracks.patch_points, this_T_patch, self._rig)
+        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)
+        left = align(view.left, tracks.patches, tracks.raw_px + off[0], warps[0], self.grid).moved(-off[0])
         left_px, left_covariance = self._left(left)
         seen = self.accepts(left) & np.isfinite(left_px).all(axis=1)
         self._noise.learn_mismatch(left, tracks.patches, seen)
         start = np.where(seen[:, None], self._expected_right(left_px, depth_m) + right_offset_px, np.nan)
-        right_px, right_covariance = self._right(align(view.right, tracks.patches, start, warps[1], self.grid))
+        right = align(view.right, tracks.patches, start + off[1], warps[1], self.grid).moved(-off[1])
+        right_px, right_covariance = self._right(right)
         return Sighting(left_px, left_covariance, right_px, right_covariance), left.px, seen
 
     def complete(self, view: Keyview, tracks: Tracks, chain_T_this: Float, left: Alignment) -> Sighting:
         """Observations of n tracks whose left patches have been aligned already, with their right matches."""
-        warp = linear_warps(tracks.patch_points, inverse(chain_T_this) @ tracks.patch_poses, self._rig)[1]
+        this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
+        warp = linear_warps(tracks.patch_points, this_T_patch, self._rig)[1]
+        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)[1]
         left_px, left_covariance = self._left(left)
         start = self._expected_right(left_px, tracks.points[:, 2])
-        right_px, right_covariance = self._right(align(view.right, tracks.patches, start, warp, self.grid))
+        right = align(view.right, tracks.patches, start + off, warp, self.grid).moved(-off)
+        right_px, right_covariance = self._right(right)
         return Sighting(left_px, left_covariance, right_px, right_covariance)
 
     def _expected_right(self, left_px: Float, depth_m: Float) -> Float:

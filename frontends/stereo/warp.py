@@ -6,6 +6,10 @@ from ...factors.camera import CameraModel
 from ..undistort import distortion_jacobian
 from .geometry import Float, StereoGeometry, project
 
+_BEND_STEP_PX = 3.0
+_LARGEST_OFFSET_PX = 0.3
+"""Beyond it the view differs so much that a bent patch is no description."""
+
 
 def transform_each(a_T_b: Float, b_p: Float) -> Float:
     """Points (n, 3), each with a pose (n, 4, 4) of its own."""
@@ -48,6 +52,37 @@ def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) 
         usable = known & np.isfinite(warp).all(axis=(1, 2)) & (determinant > 0.1) & (determinant < 10.0)
         warps.append(np.where(usable[:, None, None], warp, np.eye(2)))
     return warps[0], warps[1]
+
+
+def warp_offsets(
+    patch_points: Float, this_T_patch: Float, rig: StereoGeometry, moment_px2: float
+) -> tuple[Float, Float]:
+    """How far (n, 2) a patch's best fit lies from its centre's own place, in left and right pixels.
+
+    A patch that is turned away is not only stretched but bent: the best linear warp is off in the middle by half the
+    curvature times the second moment of the patch's weights. A hundredth of a pixel, but to the same side all over
+    that side of the image: it would look like another focal length. (The lens's own bend is left out: it is smaller.)
+
+    Args:
+        patch_points, this_T_patch, rig: as for `linear_warps`.
+        moment_px2: of the weights along either axis.
+    """
+    known = np.asarray(np.isfinite(patch_points).all(axis=1))
+    points = np.where(known[:, None], patch_points, [0.0, 0.0, 1.0])
+    step = _BEND_STEP_PX * points[:, 2, None] * np.array([1.0 / rig.left.fx, 1.0 / rig.left.fy])
+    moved = np.broadcast_to(points, (5, len(points), 3)).copy()
+    moved[1, :, 0] += step[:, 0]
+    moved[2, :, 0] -= step[:, 0]
+    moved[3, :, 1] += step[:, 1]
+    moved[4, :, 1] -= step[:, 1]
+    here = np.stack([transform_each(this_T_patch, place) for place in moved])
+    offsets = []
+    for camera, seen in ((rig.left, here), (rig.right, here @ rig.right_T_left[:3, :3].T + rig.right_T_left[:3, 3])):
+        px = np.stack([project(place, camera) for place in seen])
+        offset = 0.5 * moment_px2 / _BEND_STEP_PX**2 * (px[1:].sum(axis=0) - 4.0 * px[0])
+        usable = known & np.isfinite(offset).all(axis=1) & (np.abs(offset) < _LARGEST_OFFSET_PX).all(axis=1)
+        offsets.append(np.where(usable[:, None], offset, 0.0))
+    return offsets[0], offsets[1]
 
 
 def _with_lens(warp: Float, px: Float, patch_px: Float, camera: CameraModel, patch_camera: CameraModel) -> Float:
