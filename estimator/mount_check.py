@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import block_diag, csr_matrix, identity
 
 from ..factors.calibration import depth_sigmas
 from ..factors.cloud import plane_factor
@@ -104,14 +105,14 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     start.update(base, pose3(placed.o_T_b))
     planes = _planes(found, cloud, base, start, engine.rig.gates.robust_sigma)
     kept = [i for i, (_, _, record) in enumerate(active) if record.family not in ("mount", CLOUD, CYLINDER)]
-    inflation = np.concatenate([system.inflation[system.starts[i] : system.starts[i + 1]] for i in kept])
+    root = _root_of(system, kept)
     factors = [active[i][1] for i in kept] + planes
     factors.append(weak_pose_prior(base, start.atPose3(base), 1.0, 1.0))
-    without = _system(factors, start, inflation)
+    without = _system(factors, start, root)
     solved = _solved(without, start)
     pipes = [seen for seen in engine.depth_pipes.seen.values() if _fits(seen, without, solved)]
     if pipes:
-        without = _system(factors + [seen.factor() for seen in pipes], solved, inflation)
+        without = _system(factors + [seen.factor() for seen in pipes], solved, root)
         solved = _solved(without, solved)
     unit = gtsam.BetweenFactorPose3(engine.boards.key(mount.board), base, mount_pose(mount), pose_sigmas(1.0, 1.0))
     linear = unit.linearize(solved)
@@ -128,13 +129,23 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     )  # fmt: skip
 
 
-def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, inflation: Float) -> LinearSystem:
+def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
+    """The part of the errors' correlation that belongs to some factors."""
+    if system.root is None:
+        return None
+    rows = np.concatenate([np.arange(system.starts[i], system.starts[i + 1]) for i in kept])
+    return csr_matrix(system.root[rows][:, rows])
+
+
+def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, root: csr_matrix | None) -> LinearSystem:
     """The linear system of factors, the first rows' errors as correlated as in the full one."""
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
     system = LinearSystem(graph, values)
-    system.inflation[: len(inflation)] = inflation
+    if root is not None:
+        rest = len(system.b) - root.indptr.size + 1
+        system.root = csr_matrix(block_diag((root, identity(rest))))
     return system
 
 
