@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,7 +144,9 @@ class Inspection:
         if len(seen) < 2:
             return seen
         key = (sheet.board.id, seen[0].camera)
-        fit = self._fit(sheet, seen)
+        # the page's tolerance is no contradiction: judged with what the rig allows on top of the corners' own noise
+        judged = [replace(s, common_px=None) for s in seen]
+        fit = self._fit(sheet, judged)
         past = self._fits.setdefault(key, [])
         scale = max(1.0, float(np.median(past))) if len(past) > 4 else 1.0
         if fit is not None and fit[0] < chi2_isf(FALSE_ALARM, fit[1]) * scale:
@@ -152,8 +154,8 @@ class Inspection:
             self._clear(sheet, seen)
             return seen
         board, common = sheet.board, self._rig.noise.marker_common_px
-        side = self._side(sheet) if sheet.page_known else self._side_without_one(sheet, seen)
-        found = suspicious_markers(seen, board, self._pinhole(seen[0].camera), side, common)
+        side = self._side(sheet) if sheet.page_known else self._side_without_one(sheet, judged)
+        found = suspicious_markers(judged, board, self._pinhole(seen[0].camera), side, common)
         if not found:
             if fit is not None:
                 self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
