@@ -84,12 +84,7 @@ class CornerFactors:
         return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
-        """A corner's lasting detection error on the page, from its size in this first view.
-
-        Zero where the pixels were at hand: of the fit to them nothing lasts from place to place but an inset.
-        """
-        if sighting.common_px is not None:
-            return 0.0
+        """A corner's lasting detection error on the page, from its size in this first view."""
         diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
         return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
 
@@ -106,5 +101,5 @@ class CornerFactors:
             self._news.refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
             return None
         given = self._rig.noise.marker_common_px
-        common = given if sighting.common_px is None else sighting.common_px
+        common = max(given, sighting.common_px or 0.0)
         return added_covariance(corner_covariance(sighting, given), common, cells.views)

@@ -33,8 +33,8 @@ class MarkerSighting:
     raw_px: Float
     """Shape (4, 2), as found in the image, for drawing."""
     common_px: float | None = None
-    """Sigma of the part of it that views from the same place have in common; None: not known, so that the rig's
-    `marker_common_px` comes on top of the covariance."""
+    """Sigma of the part of it that views from the same place have in common, where the front end knows; the rig's
+    `marker_common_px` is the least."""
 
 
 @dataclass(frozen=True, slots=True)
