@@ -12,16 +12,6 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.board import distance_factor
-from ..factors.calibration import (
-    cal3,
-    depth_prior,
-    depth_ray_prior,
-    intrinsics_prior,
-    left_T_right,
-    rgb_mean,
-    rgb_prior,
-    stereo_prior,
-)
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose, weak_pose_prior
@@ -41,6 +31,7 @@ from ..frontends.pick_image import CutOut
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .bundle import Bundle
+from .calibration_states import opened_calibration
 from .depth_pipes import DepthPipes
 from .graph import Record, State, Update
 from .incremental import Incremental
@@ -61,8 +52,6 @@ corners of all of them."""
 
 COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
-NOMINAL_DEPTH_FOCAL_PX = 580.0
-"""Of a Kinect v1, where clouds come without camera_info: turns the rig file's pixels into angles."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
 
@@ -121,7 +110,7 @@ class Engine:
         self.end_ns = max(self.end_ns, bundle.stamp_ns)
         if bundle.moved is not None:
             self._move_base(bundle.moved)
-        self._open_calibration(bundle)
+        self._take(opened_calibration(self.state, self.rig, self.cameras, bundle))
         if bundle.frame is not None:
             self._follow(bundle.frame)
         if self._wants_keyframe(bundle):
@@ -156,45 +145,6 @@ class Engine:
             return
         self.state.values.insert(update.values)
         self._pending.extend(update)
-
-    # Calibration ----------------------------------------------------------------------------------------------
-
-    def _open_calibration(self, bundle: Bundle) -> None:
-        """Calibration states enter with their priors when their camera first delivers something."""
-        used = {s.camera for s in bundle.sightings} | {p.camera for p in bundle.picks}
-        if bundle.frame is not None:
-            used |= {"m_left", "m_right"}
-        if used & {"m_right"}:
-            used.add("m_left")
-        for camera in sorted(used):
-            if camera in keys.CAMERA_INDEX and not self.state.has(keys.intrinsics(camera)):
-                self._open_camera(camera, bundle.stamp_ns)
-        if bundle.cloud is not None and not self.state.has(keys.DEPTH):
-            update = Update()
-            update.guess(keys.DEPTH, np.zeros(2))
-            update.add(depth_prior(self.rig.kinect), _prior("Kinect depth", bundle.stamp_ns))
-            camera = self.cameras.get("b_depth")
-            focal_px = NOMINAL_DEPTH_FOCAL_PX if camera is None else camera.fx
-            update.guess(keys.DEPTH_RAYS, np.zeros(3))
-            prior = depth_ray_prior(self.rig.cameras.b_depth, focal_px)
-            update.add(prior, _prior("rays of the depth camera", bundle.stamp_ns))
-            self._take(update)
-
-    def _open_camera(self, camera: str, stamp_ns: int) -> None:
-        update = Update()
-        model = self.cameras[camera]
-        update.guess(keys.intrinsics(camera), cal3(model))
-        update.add(
-            intrinsics_prior(camera, model, getattr(self.rig.cameras, camera)), _prior(f"intrinsics {camera}", stamp_ns)
-        )
-        if camera == "m_right":
-            mean = left_T_right(self.cameras["m_left"], model, self.rig.stereo)
-            update.guess(keys.extrinsics(camera), mean)
-            update.add(stereo_prior(mean, self.rig.stereo), _prior("m_left_T_m_right", stamp_ns))
-        if camera == "b_rgb":
-            update.guess(keys.extrinsics(camera), rgb_mean(self.rig.kinect))
-            update.add(rgb_prior(self.rig.kinect), _prior("b_T_rgb", stamp_ns))
-        self._take(update)
 
     # Keyframes ------------------------------------------------------------------------------------------------
 
@@ -501,10 +451,6 @@ class Engine:
 def distance_name(distance: Distance) -> str:
     """How the factor of a known distance is called in its record."""
     return f"distance {distance.point_a} to {distance.point_b}"
-
-
-def _prior(name: str, stamp_ns: int) -> Record:
-    return Record("calibration priors", name, stamp_ns, f"prior of {name}", rejectable=False)
 
 
 def _mobile(bundle: Bundle) -> list[MarkerSighting]:

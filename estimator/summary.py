@@ -25,8 +25,9 @@ from . import dark_uncertainty
 from .advice import advise
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
+from .calibration_states import depth_focal_px
 from .consistency import family_tests, judge, prior_tests
-from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
+from .engine import Engine, distance_name
 from .marker_points import parse_point
 from .motions import motions
 from .mount_check import compared_with_cloud
@@ -255,7 +256,7 @@ class Summary:
             )
             value, sigma = self._values.atVector(keys.DEPTH_RAYS), self._sigmas(keys.DEPTH_RAYS)
             camera, model = rig.cameras.b_depth, engine.cameras.get("b_depth")
-            prior = depth_ray_sigmas(camera, NOMINAL_DEPTH_FOCAL_PX if model is None else model.fx)
+            prior = depth_ray_sigmas(camera, depth_focal_px(model))
             names = (("x", "centre"), ("y", "centre"), ("scale", "focal"))
             for i, (part, settled) in enumerate(names):
                 rows.append(
