@@ -67,6 +67,9 @@ class Boards:
     def rejected(self) -> list[Rejection]:
         return [*self._refused, *self.inspection.rejected]
 
+    def lists_of_rejections(self) -> list[list[Rejection]]:
+        return [self._refused, self.inspection.rejected]
+
     def known(self, board: str) -> bool:
         """Has the board a pose in the graph?"""
         return self.sheets[board].known

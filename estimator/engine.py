@@ -4,7 +4,7 @@ One engine serves offline and streaming. `add` takes all measurements of one sta
 hold something for the graph.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import gtsam
 import numpy as np
@@ -50,6 +50,10 @@ COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
+
+WAITING_BUNDLES = 200
+"""Frames without a known board that a run without end keeps."""
+WAITING_PICKS = 100
 
 
 class Engine:
@@ -233,9 +237,8 @@ class Engine:
 
     def _nearest(self, stamp_ns: int) -> tuple[gtsam.Pose3, int]:
         """The keyframe nearest in time: its pose, and how far it is, ns."""
-        stamps = np.array(self.odometry.keyframe_stamps)
-        index = int(np.argmin(np.abs(stamps - stamp_ns)))
-        return self.state.pose(keys.keyframe(index)), int(abs(stamps[index] - stamp_ns))
+        nearest = min(self.keyframe_at, key=lambda stamp: abs(stamp - stamp_ns))
+        return self.state.pose(keys.keyframe(self.keyframe_at[nearest])), abs(nearest - stamp_ns)
 
     def revisit(self) -> None:
         """Frames that saw no known board get another chance, as long as that makes more boards known."""
@@ -420,6 +423,29 @@ class Engine:
             *self.surfaces.refused.values(),
             *waiting,
         ]
+
+    # A run without end ----------------------------------------------------------------------------------------
+
+    def held_keyframes(self) -> set[int]:
+        """Keys of keyframes on which measurements hang that have not entered the graph."""
+        held = {key for sheet in self.boards.sheets.values() for key, _ in sheet.held}
+        held |= {view.keyframe for sheet in self.boards.sheets.values() for view in sheet.displaced}
+        return held | self.pipes.held_keyframes()
+
+    def forget(self, gone: Collection[int]) -> None:
+        """Variables that have left the graph: nothing may hang on them any more."""
+        left = {keys.index(k) for k in gone if keys.kind(k) == "x"}
+        landmarks = {keys.index(k) for k in gone if keys.kind(k) == "l"}
+        self.keyframe_at = {stamp: i for stamp, i in self.keyframe_at.items() if i not in left}
+        self.odometry.forget(left, landmarks)
+        self.surfaces.forget(landmarks)
+        self.pipes.forget({k for k in gone if keys.kind(k) == "x"})
+        self._waiting = self._waiting[-WAITING_BUNDLES:]
+        self.open_picks = self.open_picks[-WAITING_PICKS:]
+
+    def lists_of_rejections(self) -> list[list[Rejection]]:
+        """Where refusals gather; whoever runs for hours shortens them."""
+        return [self.rejected, *self.boards.lists_of_rejections(), self.pipes.rejected]
 
     def everything_told(self) -> list[Event]:
         return [*self.events, *self.boards.events]

@@ -1,13 +1,14 @@
 """The running solver: iSAM2 over the factors as they come."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.errors import ObservabilityError
-from .graph import FactorLog, Update
+from .graph import FactorLog, Record, Update
+from .marginal import FAMILY, marginal
 from .observability import determined
 
 Float = NDArray[np.float64]
@@ -33,6 +34,9 @@ _THRESHOLDS = {
 RELINEARIZE_EVERY = 10
 """Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
 of a batch solution; `settle` makes up for what is left at the end."""
+
+SETTLE_ROUNDS = 3
+"""Relinearisations before variables leave: what they say is frozen where it is taken."""
 
 
 class Incremental:
@@ -87,6 +91,49 @@ class Incremental:
             values = optimiser.optimize()
             self._isam = gtsam.ISAM2(_parameters())
             self._isam.update(graph, values)
+        self._values = self._isam.calculateEstimate()
+
+    def reduce(self, leaving: Collection[int], dropped: Collection[int], stamp_ns: int) -> gtsam.Values:
+        """Takes variables out of the graph and starts iSAM2 anew on the rest.
+
+        Args:
+            leaving: keys; what their factors say about the others stays, as one Gaussian factor.
+            dropped: keys that go with all of their factors, as if they had never been measured.
+
+        Raises:
+            ObservabilityError: a variable that leaves is not determined.
+        """
+        self.settle(SETTLE_ROUNDS)
+        gone, without = set(leaving), set(dropped)
+        absorbed: list[gtsam.NonlinearFactor] = []
+        log = FactorLog()
+        for _, factor, record in self.log.active():
+            involved = set(factor.keys())
+            if involved & without:
+                continue
+            if involved & gone or record.family == FAMILY:
+                absorbed.append(factor)
+            else:
+                log.factors.append(factor)
+                log.records.append(record)
+        with determined():
+            prior = marginal(absorbed, self._values, gone)
+        what = f"what earlier keyframes said about {prior.size()} variables"
+        log.factors.append(prior)
+        log.records.append(Record(FAMILY, FAMILY, stamp_ns, what, rejectable=False))
+        values = gtsam.Values(self._values)
+        for key in gone | without:
+            values.erase(key)
+        self.log = log
+        self._restart(values)
+        return gtsam.Values(self._values)
+
+    def _restart(self, values: gtsam.Values) -> None:
+        """iSAM2 anew on all factors, linearised at `values`."""
+        self._isam = gtsam.ISAM2(_parameters())
+        with determined():
+            self._isam.update(self.log.graph(), values)
+        self._slots = list(range(len(self.log.factors)))
         self._values = self._isam.calculateEstimate()
 
     def settle(self, rounds: int) -> gtsam.Values:

@@ -99,6 +99,12 @@ class Odometry:
         self.frames.append(FramePose(frame.stamp_ns, index, np.eye(4)))
         return update, rejected
 
+    def forget(self, keyframes: set[int], landmarks: set[int]) -> None:
+        """These have left the graph."""
+        self._waiting = {t: w for t, w in self._waiting.items() if w[0] not in keyframes}
+        self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
+        self.frames = [f for f in self.frames if f.keyframe not in keyframes]
+
     def _guess_pose(self, frame: StereoFrame, index: int) -> gtsam.Pose3:
         if index == 0:
             return gtsam.Pose3()

@@ -72,6 +72,16 @@ class Pipes:
         self.outlined: list[tuple[SeenFrom, OutlineSighting]] = []
         """Outlines that are in the graph."""
 
+    def held_keyframes(self) -> set[int]:
+        """Keys of the poses on which picks and outlines wait."""
+        points = {where.key for point in self.points.values() for where, _ in point.held}
+        return points | {where.key for cylinder in self.cylinders.values() for where, _ in cylinder.held}
+
+    def forget(self, poses: set[int]) -> None:
+        """These have left the graph; what was seen from them stays there."""
+        self.clicked = [(where, pick) for where, pick in self.clicked if where.key not in poses]
+        self.outlined = [(where, seen) for where, seen in self.outlined if where.key not in poses]
+
     def pipe_of(self, point_id: str) -> str:
         """The pipe that a point is on."""
         for pipe in self._rig.pipes:

@@ -94,6 +94,11 @@ def kind(key: int) -> str:
     return chr(gtsam.Symbol(key).chr())
 
 
+def index(key: int) -> int:
+    """The number of a key."""
+    return int(gtsam.Symbol(key).index())
+
+
 def words(key: int) -> str:
     """A variable's name for people."""
     symbol = gtsam.Symbol(key)
