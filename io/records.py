@@ -7,7 +7,7 @@ length the next chunk is searched for. What is lost is told in a `DamageReport`.
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from io import BytesIO
 from typing import BinaryIO
@@ -40,6 +40,22 @@ class RawMessage:
     data: bytes | memoryview
 
 
+TOO_LONG = "longer than the limit"
+NO_END = "no end mark"
+
+
+@dataclass(frozen=True, slots=True)
+class Untrusted:
+    """How to read a stream that a stranger sends and that may never end."""
+
+    maximum_bytes: int
+    """Longer records, and chunks that hold more, are passed over without being kept."""
+    on_damage: Callable[[Damage], None]
+    """Is told of every flaw; the report keeps none."""
+    resynchronise: bool = True
+    """False: a corrupt length ends the stream, for there is a better cure than to search for the next chunk."""
+
+
 Record = Header | Schema | Channel | RawMessage | Attachment | Metadata
 
 
@@ -49,17 +65,26 @@ class RecordStream:
     Args:
         size: bytes of the whole file, where known: a record that is longer than what is left is found at once.
         with_crc: check the checksum over all records, where the writer gave one.
+        untrusted: bounds, where the stream comes from a network.
 
     Raises (while iterating):
         LogError: empty, or not an MCAP.
     """
 
-    def __init__(self, stream: BinaryIO, label: str, size: int | None = None, with_crc: bool = True) -> None:
+    def __init__(
+        self,
+        stream: BinaryIO,
+        label: str,
+        size: int | None = None,
+        with_crc: bool = True,
+        untrusted: Untrusted | None = None,
+    ) -> None:
         self.report = DamageReport(label)
         self._bytes = ByteStream(stream, with_crc)
         self._crc: int | None = None
         self._label = label
         self._size = size
+        self._untrusted = untrusted
 
     def __iter__(self) -> Iterator[Record]:
         self._magic()
@@ -71,6 +96,8 @@ class RecordStream:
             if not self._plausible(opcode, length):
                 if not self._resynchronise(offset, head_bytes(opcode, length), "the record's length is corrupt"):
                     return
+            elif self._is_too_long(length):
+                self._pass_over(offset, length)
             elif opcode == CHUNK_OPCODE:
                 yield from self._chunk(offset, length)
             else:
@@ -102,7 +129,7 @@ class RecordStream:
         data = self._bytes.read_up_to(_HEADER)
         if len(data) < _HEADER:
             if not self.report.ends_cut:
-                self._add(Damage("cut", offset, len(data), "no end mark"))
+                self._add(Damage("cut", offset, len(data), NO_END))
             return None
         opcode, length = struct.unpack("<BQ", data)
         return opcode, length, offset
@@ -130,6 +157,9 @@ class RecordStream:
                 self._resynchronise(offset, head_bytes(CHUNK_OPCODE, length) + start, "a chunk's header is corrupt")
             return
         self._bytes.put_back(start)
+        if self._is_too_long(header.size):
+            self._pass_over(offset, length)
+            return
         try:
             body = self._bytes.read(length)
         except EndOfStream as end:
@@ -171,8 +201,21 @@ class RecordStream:
         elif record is not None:
             yield record
 
+    def _is_too_long(self, length: int) -> bool:
+        return self._untrusted is not None and length > self._untrusted.maximum_bytes
+
+    def _pass_over(self, offset: int, length: int) -> None:
+        """Read a record's body without keeping it."""
+        left = length
+        while left > 0 and (data := self._bytes.read_up_to(min(left, 1 << 20))):
+            left -= len(data)
+        self._add(Damage("corrupt", offset, _HEADER + length - left, TOO_LONG))
+
     def _resynchronise(self, offset: int, seen: bytes, reason: str) -> bool:
         """Search for the next chunk after `offset`, from where `seen` was read; False: there is none."""
+        if self._untrusted is not None and not self._untrusted.resynchronise:
+            self._add(Damage("cut", offset, len(seen), reason))
+            return False
         self._bytes.put_back(seen[1:])
         window = b""
         while True:
@@ -196,7 +239,10 @@ class RecordStream:
         return fits and chunk_header(record, length) is not None
 
     def _add(self, damage: Damage) -> None:
-        self.report.places.append(damage)
+        if self._untrusted is not None:
+            self._untrusted.on_damage(damage)
+        else:
+            self.report.places.append(damage)
 
 
 def head_bytes(opcode: int, length: int) -> bytes:

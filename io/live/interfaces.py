@@ -52,12 +52,21 @@ class Source(Protocol):
         """Whether nothing will come any more: the recording or the pipe is at its end, or `stop` was called."""
         ...
 
+    def connected(self) -> bool:
+        """Whether the link stands now. Says nothing about whether messages come."""
+        ...
+
+    def status(self) -> str:
+        """One line for people: what it is connected to, or why it is not, and the last thing that was wrong."""
+        ...
+
     def counters(self) -> Mapping[str, int]:
         """Totals since `start`: `received` (all that arrived), `delivered`, and what was skipped, by reason.
 
-        Reasons: `malformed`, `oversized`, `unknown_encoding`, `wrong_type`, `unstamped`, `stamp_outlier`,
-        `size_changed`, `calibration_changed`, `other_publisher`, `not_finite`, `dropped`; `reconnects` and
-        `clock_jumps` tell of the link. A name may be absent until it has happened.
+        Reasons: `malformed`, `oversized`, `ignored` (a topic that nobody asked for), `unknown_type`,
+        `unknown_encoding`, `wrong_type`, `unstamped`, `stamp_outlier`, `size_changed`, `calibration_changed`,
+        `other_publisher`, `not_finite`; `reconnects` and `clock_jumps` tell of the link. A name may be absent until it
+        has happened.
         """
         ...
 

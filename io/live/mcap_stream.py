@@ -1,0 +1,194 @@
+"""MCAP as a stream, from standard input or a TCP server: needs nothing installed on the sender's side."""
+
+import threading
+import time
+from collections.abc import Mapping
+from typing import BinaryIO
+from urllib.parse import urlsplit
+
+from mcap.records import Channel, Schema
+
+from ...factors.errors import LogError
+from ..damage import Damage
+from ..decode import ChannelInfo
+from ..records import NO_END, TOO_LONG, RawMessage, RecordStream, Untrusted
+from .admission import Expected, Limits
+from .backoff import Backoff
+from .descriptors import opened
+from .intake import Intake
+from .interfaces import Clock, Deliver
+
+_MAXIMUM_SCHEMA = 1 << 20
+_CONNECT_S = 5.0
+
+
+class McapStream:
+    """A source that reads one MCAP stream from its beginning; a lost connection is opened again.
+
+    Senders should write without chunks, or flush after each message: a message arrives when its chunk is complete.
+
+    Args:
+        address: `-` for standard input, or `tcp://HOST:PORT`.
+        patient: for standard input that is a file: wait instead of dropping.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        expected: Expected | None = None,
+        *,
+        limits: Limits | None = None,
+        clock: Clock = time.time_ns,
+        patient: bool = False,
+    ) -> None:
+        self._address = address
+        self._target = tcp_target(address)
+        self._intake = Intake(clock, expected, limits)
+        self._patient = patient
+        self._stopping = threading.Event()
+        self._finished = threading.Event()
+        self._connected = False
+        self._status = "not started"
+        self._thread: threading.Thread | None = None
+
+    @property
+    def name(self) -> str:
+        return "MCAP from standard input" if self._target is None else f"MCAP from {self._address}"
+
+    @property
+    def patient(self) -> bool:
+        return self._patient
+
+    def start(self, deliver: Deliver) -> None:
+        self._intake.open(deliver)
+        self._thread = threading.Thread(target=self._run, name="surecut-mcap", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopping.set()
+        self._intake.close()
+        if self._thread is not None:
+            self._thread.join(_CONNECT_S + 1)
+        self._finished.set()
+
+    def ended(self) -> bool:
+        return self._finished.is_set()
+
+    def connected(self) -> bool:
+        return self._connected
+
+    def status(self) -> str:
+        problem = self._intake.last_problem()
+        return f"{self.name}: {self._status}" + (f"; last problem: {problem}" if problem else "")
+
+    def counters(self) -> Mapping[str, int]:
+        return self._intake.counters()
+
+    def by_topic(self) -> Mapping[str, Mapping[str, int]]:
+        return self._intake.by_topic()
+
+    def _run(self) -> None:
+        backoff = Backoff()
+        while not self._stopping.is_set():
+            try:
+                with opened(self._target, self._stopping, _CONNECT_S) as stream:
+                    self._connected, self._status = True, "connected"
+                    if self._read(stream):
+                        backoff.succeeded()
+                self._status = "the stream ended"
+            except (OSError, LogError) as error:
+                self._status = str(error)
+            self._connected = False
+            if self._target is None or backoff.wait(self._stopping):
+                break
+            self._intake.tally.add("reconnects")
+        self._finished.set()
+
+    def _read(self, stream: BinaryIO) -> bool:
+        """Read to the end; whether there was any record.
+
+        Raises:
+            LogError: the stream is empty, or no MCAP.
+        """
+        rules = Untrusted(self._intake.limits.message_bytes, self._damaged, resynchronise=self._target is None)
+        channels = _Channels(self._intake.limits.channels)
+        any_record = False
+        for record in RecordStream(stream, self.name, with_crc=False, untrusted=rules):
+            any_record = True
+            if self._stopping.is_set():
+                break
+            if isinstance(record, Schema | Channel):
+                channels.add(record)
+            elif isinstance(record, RawMessage):
+                self._message(channels, record)
+        return any_record
+
+    def _message(self, channels: "_Channels", record: RawMessage) -> None:
+        channel = channels.get(record.channel_id)
+        if channel is None:
+            self._intake.refuse("malformed", None, f"a message on channel {record.channel_id}, which nothing describes")
+            return
+        # a copy: a view would keep the whole chunk
+        self._intake.take(channel, bytes(record.data), str(record.channel_id), record.log_time_ns)
+
+    def _damaged(self, damage: Damage) -> None:
+        if damage.reason == NO_END:
+            return  # how a live stream ends
+        self._intake.refuse(
+            "oversized" if damage.reason == TOO_LONG else "malformed", None, f"{damage.kind}: {damage.reason}"
+        )
+
+
+class _Channels:
+    """Channels by number, as many as are allowed."""
+
+    def __init__(self, maximum: int) -> None:
+        self._maximum = maximum
+        self._schemas: dict[int, Schema] = {}
+        self._records: dict[int, Channel] = {}
+        self._known: dict[int, ChannelInfo] = {}
+
+    def add(self, record: Schema | Channel) -> None:
+        self._known.clear()
+        if isinstance(record, Schema):
+            if len(record.data) <= _MAXIMUM_SCHEMA and (record.id in self._schemas or self._room(self._schemas)):
+                self._schemas[record.id] = record
+        elif record.id in self._records or self._room(self._records):
+            self._records[record.id] = record
+
+    def get(self, number: int) -> ChannelInfo | None:
+        known = self._known.get(number)
+        if known is not None:
+            return known
+        channel = self._records.get(number)
+        if channel is None:
+            return None
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None and channel.schema_id != 0:
+            return None
+        name, encoding, data = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
+        info = ChannelInfo(channel.topic, channel.message_encoding, name, encoding, data)
+        self._known[number] = info
+        return info
+
+    def _room(self, table: Mapping[int, object]) -> bool:
+        return len(table) < self._maximum
+
+
+def tcp_target(address: str) -> tuple[str, int] | None:
+    """Host and port of `tcp://HOST:PORT`; None for `-`.
+
+    Raises:
+        LogError: it is neither.
+    """
+    if address == "-":
+        return None
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+        parts = urlsplit("")
+    if parts.scheme != "tcp" or host is None or port is None:
+        raise LogError(f"{address}: is no address of an MCAP stream; give - or tcp://HOST:PORT")
+    return host, port
