@@ -11,10 +11,10 @@ from ..factors.errors import RigError
 from ..factors.measurements import MarkerSighting, Pick, StereoFrame
 from ..factors.rig import Board, Rig
 from ..frontends.paper_chain import clicked_point, marker_pose, plain_sightings
-from ..io.messages import CameraInfoBody, DetectionsBody, Message, PickBody
+from ..io.messages import DetectionsBody, Message, PickBody
 from ..io.pairing import StereoPair
 from .baseline import BoardChoice, BoardView, ChainPoint, ClickedPoint, behind_surface, paper_chain
-from .pipeline import Item, Pipeline
+from .sensing import Item, Sensing, images
 from .sensors import PairImages
 
 Float = NDArray[np.float64]
@@ -48,8 +48,8 @@ def gather(messages: Iterable[Message], rig: Rig) -> ChainInput:
     if rig.mount is None:
         raise RigError("rig: the chain needs the mount f_T_b; add the section mount")
     collector = _Collector(rig, mount_board(rig))
-    for _ in collector.run(messages):
-        pass
+    for group in collector.groups(messages):
+        collector.collect(group)
     return ChainInput(collector.view, tuple(collector.frames), tuple(collector.clicks))
 
 
@@ -80,22 +80,20 @@ def pipe_radius_m(rig: Rig, point_id: str) -> float:
     return 0.0
 
 
-class _Collector(Pipeline):
-    """The estimator's own reading of a log, with the chain's single measurements in the place of the graph."""
+class _Collector(Sensing):
+    """The estimator's own reading of a log, kept as the chain's single measurements."""
 
     def __init__(self, rig: Rig, board: Board) -> None:
-        super().__init__(rig, lambda landmarks_m, sigma_m, cloud: ([], []))
+        super().__init__(rig)
         self.view: BoardView | None = None
         self.frames: list[StereoFrame] = []
         self.clicks: list[ClickedPoint] = []
         self._board = board
 
-    def process(self, group: list[Item]) -> None:
+    def collect(self, group: list[Item]) -> None:
         """All messages of one stamp."""
-        for item in group:
-            if isinstance(item, Message) and isinstance(item.body, CameraInfoBody) and item.topic in self._info:
-                self.sensors.calibrate(self._info[item.topic], item.body.camera)
-        pair = next((self._images(item) for item in group if isinstance(item, StereoPair)), None)
+        self.calibrate(group)
+        pair = next((images(item) for item in group if isinstance(item, StereoPair)), None)
         if pair is not None:
             self.frames.append(self.sensors.track(pair))
         if self.view is None:
@@ -111,7 +109,7 @@ class _Collector(Pipeline):
             sightings = plain_sightings(pair.stamp_ns, pair.left, self._board, camera)
         for item in group:
             if isinstance(item, Message) and isinstance(item.body, DetectionsBody):
-                camera = self._camera_of(item.topic)
+                camera = self.camera_of(item.topic)
                 if camera == "m_left":
                     sightings = [*sightings, *self.sensors.detections(camera, item.stamp_ns, item.body)]
         if not sightings:

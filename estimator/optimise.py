@@ -1,7 +1,7 @@
 """A recorded log in, the joint estimate out: reads, runs the pipeline, refines, checks what is missing."""
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -11,9 +11,10 @@ from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
 from ..io.ordering import OrderReport
 from ..io.reader import LogReader
-from .pipeline import Pipeline, wanted_topics
+from .pipeline import Pipeline
 from .result import Result
 from .run import finish
+from .sensed_log import SensedLog, opened
 from .stopwatch import Stopwatch
 
 Progress = Callable[[int], None]
@@ -41,11 +42,13 @@ def optimise(
     between: tuple[tuple[str, str], ...] = (),
     progress: Progress | None = None,
     command: str = "",
+    processes: int = 1,
 ) -> Result:
     """The joint estimate of one recording.
 
     Args:
         between: pairs of marker points whose distance is wanted too, such as ("29/0", "60/0").
+        processes: 2 runs the front ends beside the graph, in a process of their own; the result is the same.
 
     Raises:
         SurecutError: one line; what is wrong with log or rig, where, and the cure.
@@ -54,46 +57,48 @@ def optimise(
     with LogReader(log) as reader:
         rig = rig_of(reader, rig_file)
     pipeline = Pipeline(rig)
-    reader = LogReader(log, wanted_topics(rig))
-    with told_of(log, reader), watch("run"):
-        for stamp_ns in pipeline.run(reader):
-            if progress is not None:
-                progress(stamp_ns)
-        pipeline.check()
-    sha256 = reader.sha256()
-    with told_of(log, reader), watch("refine"):
-        result = finish(
-            pipeline.engine,
-            between,
-            watch.seconds,
-            {
-                "surecut": version("surecut"),
-                "gtsam": version("gtsam"),
-                "log": log.name,
-                "log_sha256": sha256,
-                "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
-                "command": command,
-            },
-            [*pipeline.sensors.rejected],
-            [*_damage(reader, pipeline.engine.end_ns), *odd_stamps(pipeline.order, rig, pipeline.engine.end_ns)],
-        )
-    return result
+    with opened(log, rig, processes) as recording, told_of(log, recording):
+        with watch("run"):
+            for stamp_ns in pipeline.run(recording):
+                if progress is not None:
+                    progress(stamp_ns)
+            report = recording.report
+            pipeline.check(report.sensing)
+        with watch("refine"):
+            return finish(
+                pipeline.engine,
+                between,
+                watch.seconds,
+                {
+                    "surecut": version("surecut"),
+                    "gtsam": version("gtsam"),
+                    "log": log.name,
+                    "log_sha256": report.sha256,
+                    "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
+                    "command": command,
+                },
+                report.sensing.rejected,
+                [
+                    *_damage(report.warnings, pipeline.engine.end_ns),
+                    *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
+                ],
+            )
 
 
 @contextmanager
-def told_of(log: Path, reader: LogReader) -> Iterator[None]:
+def told_of(log: Path, recording: SensedLog) -> Iterator[None]:
     """Errors name the log, and what of it could not be read: that may be why."""
     try:
         yield
     except SurecutError as error:
         text = str(error)
         name = "" if str(log) in text else f"{log}: "
-        damage = "".join(f" (the log is damaged: {w})" for w in reader.warnings if w not in text)
+        damage = "".join(f" (the log is damaged: {w})" for w in recording.report.warnings if w not in text)
         raise type(error)(f"{name}{text}{damage}") from error
 
 
-def _damage(reader: LogReader, end_ns: int) -> list[Event]:
-    return [Event(end_ns, "log_damaged", warning, "warning") for warning in reader.warnings]
+def _damage(warnings: Sequence[str], end_ns: int) -> list[Event]:
+    return [Event(end_ns, "log_damaged", warning, "warning") for warning in warnings]
 
 
 def odd_stamps(order: OrderReport, rig: Rig, end_ns: int) -> list[Event]:

@@ -16,7 +16,6 @@ from ..frontends.cloud.frontend import CloudFrontEnd, average_depth
 from ..frontends.fiducials.detector import MarkerFrontEnd
 from ..frontends.fiducials.messages import sightings_from_messages
 from ..frontends.paper_chain import clicked_point
-from ..frontends.pipe.silhouette import OutlineFinder
 from ..frontends.stereo.frontend import StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
@@ -61,7 +60,6 @@ class Sensors:
         self.cameras: dict[str, CameraModel] = {}
         self._stereo: StereoFrontEnd | None = None
         self._markers: dict[str, MarkerFrontEnd] = {}
-        self._outlines: dict[str, OutlineFinder] = {}
         self._clouds: CloudFrontEnd | None = None
         self._depths: list[tuple[int, NDArray[np.float32]]] = []
         self._unmatched = 0
@@ -225,11 +223,6 @@ class Sensors:
             )
         name = cast(CameraName, body.camera)
         return Pick(stamp_ns, name, body.point_id, body.role, ideal[0], np.asarray(body.px, float), spread[0])  # type: ignore[arg-type]
-
-    def outline_finder(self, camera: str) -> OutlineFinder:
-        if camera not in self._outlines:
-            self._outlines[camera] = OutlineFinder(self.cameras[camera])
-        return self._outlines[camera]
 
 
 def _matched(frame: StereoFrame) -> int:

@@ -10,7 +10,7 @@ import yaml
 
 from ..estimator.compare import chain_of_messages
 from ..estimator.optimise import optimise, rig_of
-from ..estimator.pipeline import wanted_topics
+from ..estimator.sensing import wanted_topics
 from ..estimator.stopwatch import Stopwatch
 from ..factors.errors import LogError, SurecutError
 from ..io.messages import PointsBody, PoseBody

@@ -11,8 +11,8 @@ from PIL import Image
 
 from surecut.estimator.cli import main
 from surecut.estimator.pick_views import PER_POINT
-from surecut.estimator.pipeline import Pipeline
 from surecut.estimator.result_json import from_json, to_json
+from surecut.estimator.sensing import Sensing
 from surecut.factors.errors import SurecutError
 from surecut.factors.measurements import Pick
 from surecut.factors.rig import load_rig
@@ -117,14 +117,12 @@ def test_report_lists_the_picks(optimised, tmp_path):
 
 def test_a_click_in_the_kinects_colour_image():
     """The image comes before the click, or with it; a click in a camera without image leaves none."""
-    pipeline = Pipeline(load_rig(cell.RIG))
+    sensing = Sensing(load_rig(cell.RIG))
     picture = np.random.default_rng(3).integers(0, 255, (480, 640, 3), dtype=np.uint8)
     raw = RawPixels("bgr8", 640, 480, 3 * 640, False, picture.ravel())
     shown = Message("/b/rgb/image_raw", 5, 5, "b_rgb", ImageBody(raw, "/b/rgb/image_raw at 5 ns"))
     click = Pick(7, "b_rgb", "P1", "cut", np.array([320.0, 240.0]), np.array([320.0, 240.0]), np.eye(2))
-    pipeline._keep_pick_images([click], None, [])
-    assert pipeline.engine.pick_images == {}
-    pipeline._keep_pick_images([], None, [shown])
-    pipeline._keep_pick_images([click], None, [])
-    found = pipeline.engine.pick_images["b_rgb", 7, "P1"]
+    assert sensing._clicked((click,), None, []) == {}
+    sensing._clicked((), None, [shown])
+    found = sensing._clicked((click,), None, [])["b_rgb", 7, "P1"]
     assert found.corner_px == (320 - 106, 240 - 106)

@@ -17,9 +17,9 @@ from ..baseline import ChainPoint
 from ..compare import chain_of_messages
 from ..optimise import rig_of
 from ..output_files import write_text
-from ..pipeline import wanted_topics
 from ..result import Result
 from ..result_json import from_json
+from ..sensing import wanted_topics
 
 Float = NDArray[np.float64]
 TRUTH = "/truth/points"

@@ -33,6 +33,9 @@ HELP_EPILOG = """Examples:
   surecut optimise day/*.mcap -o results/ --jobs 8 --resume
 """
 
+PROCESSES = 2
+"""One log alone: front ends and graph beside each other. Several logs share the cores by `--jobs` instead."""
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -164,7 +167,7 @@ def _with_progress(job: Job) -> Result:
         def advance(stamp_ns: int) -> None:
             bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
-        result = optimise(job.log, job.rig, job.between, advance, job.command)
+        result = optimise(job.log, job.rig, job.between, advance, job.command, processes=PROCESSES)
     _write(job, result)
     return result
 

@@ -11,7 +11,7 @@ from ...factors.measurements import CameraName, OutlineSighting, Rejection
 from ..rays import ideal_grid
 from ..undistort import distort, undistort
 from .edges import EdgeLine, image_noise, straight_lines
-from .limb import EdgeFit, fit_edge
+from .limb import EdgeFit, EdgeSeed, fit_edges
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
 from .surface import occlusion_score, region_edges, region_score, sampled
 
@@ -143,24 +143,23 @@ class OutlineFinder:
     def _refined(
         self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float
     ) -> list[_Found]:
-        values, px = grey.ravel(), ideal.reshape(-1, 2)
-        fits: dict[tuple[int, bool], EdgeFit | None] = {}
-        found = []
         known = prior.half_width_px is not None
-        for pair in pairs[: self._config.refined_known if known else self._config.refined_pairs]:
-            both = []
+        pairs = pairs[: self._config.refined_known if known else self._config.refined_pairs]
+        seeds: dict[tuple[int, bool], EdgeSeed] = {}
+        keys = []
+        for pair in pairs:
             for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
-                foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
                 key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
-                if key not in fits:
-                    span = edge.span if key[1] else (-edge.span[1], -edge.span[0])
-                    span = (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0))
-                    fits[key] = fit_edge(values, px, line, foot, span, 0.5 * pair.width_px, noise)
-                both.append(fits[key])
-            if both[0] is None or both[1] is None:
+                keys.append(key)
+                seeds.setdefault(key, _seed(line, edge.span if key[1] else (-edge.span[1], -edge.span[0]), prior, pair))
+        fits = dict(zip(seeds, fit_edges(grey.ravel(), ideal.reshape(-1, 2), [*seeds.values()], noise), strict=True))
+        found = []
+        for pair, first, second in zip(pairs, keys[::2], keys[1::2], strict=True):
+            one, other = fits[first], fits[second]
+            if one is None or other is None:
                 found.append(_Found(pair, None, pair.score - _NO_FIT))
             else:
-                found.append(_Found(pair, (both[0], both[1]), pair.score))
+                found.append(_Found(pair, (one, other), pair.score))
         blur = _sharp_blur(fits.values())
         return [
             f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
@@ -257,6 +256,12 @@ class OutlineFinder:
 
     def _refuse(self, stamp_ns: int, pipe_id: str, reason: str, value: float, limit: float) -> Rejection:
         return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
+
+
+def _seed(line: Float, span: tuple[float, float], prior: OutlinePrior, pair: EdgePair) -> EdgeSeed:
+    """Where the sub-pixel fit of one edge begins."""
+    foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
+    return EdgeSeed(line, foot, (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0)), 0.5 * pair.width_px)
 
 
 def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:

@@ -69,9 +69,10 @@ def _profile(
 
 
 def _flat(values: Float) -> Float:
-    """Without mean and trend."""
-    place = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    return values - values.mean() - place * float(values @ place) / float(place @ place)
+    """Without mean and trend along the last axis, shape (..., n)."""
+    place = np.arange(values.shape[-1]) - 0.5 * (values.shape[-1] - 1)
+    trend = values @ place / float(place @ place)
+    return values - values.mean(axis=-1, keepdims=True) - trend[..., None] * place
 
 
 def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, half_width_px: float) -> float:
@@ -95,13 +96,12 @@ def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, ha
     along = np.arange(-_REGION_PX, _REGION_PX + 1.0)
     grid = core_px - origin + place[:, None, None] * across + along[:, None] * axis
     strips = sampled(patch, grid)
-    strips = strips[np.isfinite(strips).mean(axis=1) > 0.99]
-    if len(strips) < len(place):
+    if (np.isfinite(strips).mean(axis=1) <= 0.99).any():
         return 0.0
     smooth = (
         strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
     )
-    variance = np.array([_flat(strip).var() for strip in smooth]) + 0.5
+    variance = _flat(smooth).var(axis=1) + 0.5
     inside = _signed(lines, core_px, place, across)
     pipe = float(np.median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)]))
     wall = float(np.median(variance[inside < -2.0])) if (inside < -2.0).any() else pipe
@@ -137,9 +137,7 @@ def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) 
     strips = sampled(patch, centre + place[:, None, None] * across + along[:, None] * axis)
     smooth = strips[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2).astype(float)
     known = np.isfinite(smooth).all(axis=1)
-    variance = (
-        np.array([_flat(strip).var() if good else np.nan for strip, good in zip(smooth, known, strict=True)]) + 0.5
-    )
+    variance = np.where(known, _flat(np.where(known[:, None], smooth, 0.0)).var(axis=1), np.nan) + 0.5
     core = variance[(np.abs(place) <= 3.0) & known]
     if len(core) < 4:
         return []

@@ -14,12 +14,12 @@ from ...estimator.commands.compare import true_points
 from ...estimator.compare import chain_of_messages
 from ...estimator.optimise import optimise, rig_of
 from ...estimator.output_files import write_text
-from ...estimator.pipeline import wanted_topics
 from ...estimator.report.content import build_document
 from ...estimator.report.html import render_html
 from ...estimator.result import Result
 from ...estimator.result_json import stored_sha256, to_json
 from ...estimator.result_log import write_result
+from ...estimator.sensing import wanted_topics
 from ...estimator.tables import result_tables
 from ...estimator.validated_range import load_validated_range
 from ...factors.rig import load_rig

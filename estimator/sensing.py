@@ -1,0 +1,226 @@
+"""Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors.camera import CameraModel
+from ..factors.measurements import CloudFrame, MarkerSighting, Pick, Rejection
+from ..factors.rig import Rig
+from ..frontends.pick_image import CutOut, cut_out
+from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
+from ..io.ordering import OrderReport, sorted_by_stamp
+from ..io.pairing import PairingReport, StereoPair, stereo_pairs
+from .bundle import Bundle
+from .sensors import PairImages, Sensors, by_info_topic
+from .sides import Sides
+
+Item = Message | StereoPair
+
+COMPRESSED = "/compressed"
+COLOUR_PERIOD_NS = 1_000_000_000
+"""Boards in the Kinect's colour image: once a second is enough for a machine that stands still."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """What the front ends make of all messages of one stamp. Plain data: it may cross a process border."""
+
+    bundle: Bundle
+    cloud: CloudFrame | None = None
+    """Surfaces, when enough depth images have gathered."""
+    pair: PairImages | None = None
+    """The pictures, where the pair is a keyframe or was clicked in."""
+    clicked: Mapping[tuple[str, int, str], CutOut] = field(default_factory=dict)
+    """What was clicked, by camera, stamp and point id."""
+    cameras: Mapping[str, CameraModel] = field(default_factory=dict)
+    """Cameras whose calibration has become known with this stamp."""
+
+    @property
+    def stamp_ns(self) -> int:
+        return self.bundle.stamp_ns
+
+
+@dataclass(frozen=True, slots=True)
+class SensingReport:
+    """What can be said of a recording once it has passed."""
+
+    order: OrderReport = field(default_factory=OrderReport)
+    pairing: PairingReport = field(default_factory=PairingReport)
+    rejected: tuple[Rejection, ...] = ()
+    """What the front ends themselves refused."""
+
+
+def wanted_topics(rig: Rig) -> frozenset[str]:
+    """The topics that the estimator reads; never the truth."""
+    topics = {rig.picks_topic, rig.kinect.points_topic}
+    for name in ("m_left", "m_right", "b_rgb", "b_depth"):
+        camera = getattr(rig.cameras, name)
+        topics |= {camera.image_topic, camera.image_topic + COMPRESSED, camera.info_topic}
+        if camera.markers_topic:
+            topics.add(camera.markers_topic)
+    return frozenset(topics)
+
+
+class Sensing:
+    """Front ends of one run, fed with messages."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.sensors = Sensors(rig)
+        self._order = OrderReport()
+        self._pairing = PairingReport()
+        self._sides = Sides(rig)
+        self._info = by_info_topic(rig)
+        self._known: set[str] = set()
+        """Cameras whose calibration has been handed on."""
+        self._started = False
+        """The first pair is a keyframe whatever it shows."""
+        self._last_colour_ns: int | None = None
+        self._colour: ImageBody | None = None
+        """The Kinect's newest colour image, not decoded."""
+
+    def run(self, messages: Iterable[Message]) -> Iterator[Sensed]:
+        """Takes messages in the order of the log; yields what is seen at each stamp, in the order of the stamps."""
+        for group in self.groups(messages):
+            yield self.process(group)
+
+    def groups(self, messages: Iterable[Message]) -> Iterator[list[Item]]:
+        """Messages by stamp: sorted, stereo images paired, those of one stamp together."""
+        ordered = sorted_by_stamp((_plain(m) for m in messages), report=self._order)
+        left, right = self.rig.cameras.m_left.image_topic, self.rig.cameras.m_right.image_topic
+        return _same_stamp(stereo_pairs(ordered, left, right, report=self._pairing))
+
+    def process(self, group: list[Item]) -> Sensed:
+        """All messages of one stamp."""
+        stamp_ns = _stamp(group[0])
+        self.calibrate(group)
+        pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
+        picks = tuple(self._pick(i) for i in group if isinstance(i, Message) and isinstance(i.body, PickBody))
+        frame = self.sensors.track(pair) if pair is not None else None
+        kept = pair if frame is not None and (frame.is_keyframe or picks or not self._started) else None
+        self._started |= frame is not None
+        sightings = self._sightings(stamp_ns, group, kept)
+        depths = {}
+        if pair is not None:
+            depths = {p.point_id: d for p in picks if (d := self.sensors.depth_under(p, pair)) is not None}
+        fresh = {name: camera for name, camera in self.sensors.cameras.items() if name not in self._known}
+        self._known |= fresh.keys()
+        return Sensed(
+            Bundle(stamp_ns, frame, tuple(sightings), picks, depths),
+            self._cloud(stamp_ns, group),
+            kept,
+            self._clicked(picks, pair, group),
+            fresh,
+        )
+
+    def report(self) -> SensingReport:
+        """What was odd, and what was refused, so far."""
+        return SensingReport(self._order, self._pairing, tuple(self.sensors.rejected))
+
+    def calibrate(self, group: list[Item]) -> None:
+        """Calibrations among the messages open their cameras."""
+        for item in group:
+            if isinstance(item, Message) and isinstance(item.body, CameraInfoBody) and item.topic in self._info:
+                self.sensors.calibrate(self._info[item.topic], item.body.camera)
+
+    def camera_of(self, topic: str) -> str | None:
+        """The camera that a topic with images or detections belongs to."""
+        for name in ("m_left", "m_right", "b_rgb"):
+            camera = getattr(self.rig.cameras, name)
+            if topic in (camera.markers_topic, camera.image_topic):
+                return name
+        return None
+
+    def _pick(self, message: Message) -> Pick:
+        assert isinstance(message.body, PickBody)
+        return self.sensors.pick(message.stamp_ns, message.body)
+
+    def _sightings(self, stamp_ns: int, group: list[Item], pair: PairImages | None) -> list[MarkerSighting]:
+        found: list[MarkerSighting] = []
+        if pair is not None:
+            found += self.sensors.markers("m_left", stamp_ns, pair.left)
+            found += self.sensors.markers("m_right", stamp_ns, pair.right)
+        for item in group:
+            if not isinstance(item, Message):
+                continue
+            camera = self.camera_of(item.topic)
+            if isinstance(item.body, DetectionsBody) and camera is not None:
+                found += self.sensors.detections(camera, stamp_ns, item.body)
+            if isinstance(item.body, ImageBody) and camera == "b_rgb" and self._colour_due(stamp_ns):
+                found += self.sensors.markers("b_rgb", stamp_ns, item.body.pixels())
+        if {"m_left", "m_right"} <= {s.camera for s in found}:
+            self._sides.look(found, self.sensors.cameras, self.sensors.left_T_right())
+        return found
+
+    def _colour_due(self, stamp_ns: int) -> bool:
+        """Is it time to look for boards in the machine's colour image?"""
+        due = self._last_colour_ns is None or stamp_ns - self._last_colour_ns >= COLOUR_PERIOD_NS
+        if due:
+            self._last_colour_ns = stamp_ns
+        return due
+
+    def _cloud(self, stamp_ns: int, group: list[Item]) -> CloudFrame | None:
+        cloud = None
+        for item in group:
+            if isinstance(item, Message) and isinstance(item.body, DepthBody):
+                if item.topic == self.rig.cameras.b_depth.image_topic:
+                    cloud = self.sensors.depth(stamp_ns, item.body.depth_m()) or cloud
+            elif isinstance(item, Message) and isinstance(item.body, CloudBody):
+                continue
+        return cloud
+
+    def _clicked(
+        self, picks: tuple[Pick, ...], pair: PairImages | None, group: list[Item]
+    ) -> dict[tuple[str, int, str], CutOut]:
+        """Cuts out what was clicked. The machine stands still: its newest colour image shows what a click there saw."""
+        for item in group:
+            if isinstance(item, Message) and isinstance(item.body, ImageBody):
+                self._colour = item.body if self.camera_of(item.topic) == "b_rgb" else self._colour
+        found = {}
+        for pick in picks:
+            image = None
+            if pick.camera == "b_rgb":
+                image = None if self._colour is None else self._colour.pixels()
+            elif pair is not None:
+                image = pair.of(pick.camera)
+            if image is not None:
+                found[pick.camera, pick.stamp_ns, pick.point_id] = cut_out(image, pick.raw_px)
+        return found
+
+
+def images(pair: StereoPair) -> PairImages:
+    """The pictures of a stereo pair."""
+    left, right = (_grey(m.body.pixels()) for m in (pair.left, pair.right) if isinstance(m.body, ImageBody))
+    return PairImages(pair.stamp_ns, left, right)
+
+
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def _plain(message: Message) -> Message:
+    """A compressed topic counts as its raw one."""
+    if not message.topic.endswith(COMPRESSED):
+        return message
+    topic = message.topic.removesuffix(COMPRESSED)
+    return Message(topic, message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
+
+
+def _stamp(item: Item) -> int:
+    return item.stamp_ns
+
+
+def _same_stamp(items: Iterable[Item]) -> Iterator[list[Item]]:
+    """Neighbours of one stamp together."""
+    group: list[Item] = []
+    for item in items:
+        if group and _stamp(item) != _stamp(group[0]):
+            yield group
+            group = []
+        group.append(item)
+    if group:
+        yield group

@@ -1,0 +1,196 @@
+"""What a camera sees across the occluding edges of cylinders: grey values as a function of where each edge is.
+
+Outside, the background is a level and a slope per stretch of the edge. Inside, a shaded cylinder changes towards its
+limb like the square root of the distance from it, which drags an ordinary step edge inwards; so the model has that
+term. Both are blurred by the same Gaussian. Grey values are used where the pixels are, nothing is interpolated.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+Float = NDArray[np.float64]
+
+_LOG_BLUR_RANGE = (float(np.log(0.4)), float(np.log(1.2)))
+"""A pixel alone blurs by 0.3 px. Edges softer than 1.2 px are shading or out of focus."""
+_USUAL_LOG_BLUR = float(np.log(0.6))
+_KINKS_PX = (0.0, 1.8, 3.2)
+"""Depths at which the shading may change its slope."""
+SHADING_TERMS = 3 + len(_KINKS_PX)
+_TREND_PX = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeStates:
+    """What is fitted, of all edges together, shape (edges,) each."""
+
+    offset: Float
+    turn: Float
+    log_blur: Float
+    shading: Float
+    """(edges, terms), coefficients of `_shading`, grey values at full depth."""
+
+    @classmethod
+    def start(cls, edges: int) -> "EdgeStates":
+        zero = np.zeros(edges)
+        return cls(zero, zero, zero + _USUAL_LOG_BLUR, np.zeros((edges, SHADING_TERMS)))
+
+    def moved(self, step: NDArray[np.floating]) -> "EdgeStates":
+        log_blur = np.clip(self.log_blur + np.clip(step[:, 2], -0.3, 0.3), *_LOG_BLUR_RANGE)
+        offset = self.offset + np.clip(step[:, 0], -0.7, 0.7)
+        return EdgeStates(offset, self.turn + np.clip(step[:, 1], -0.03, 0.03), log_blur, self.shading + step[:, 3:])
+
+    def one(self, edge: int) -> "EdgeStates":
+        part = slice(edge, edge + 1)
+        return EdgeStates(self.offset[part], self.turn[part], self.log_blur[part], self.shading[part])
+
+    def where(self, taken: NDArray[np.bool_], other: "EdgeStates") -> "EdgeStates":
+        """This state for the edges that are taken, the other's for the rest."""
+        return EdgeStates(
+            np.where(taken, self.offset, other.offset),
+            np.where(taken, self.turn, other.turn),
+            np.where(taken, self.log_blur, other.log_blur),
+            np.where(taken[:, None], self.shading, other.shading),
+        )
+
+    def deviation(self) -> Float:
+        """From the priors' means, (edges, parameters)."""
+        zero = np.zeros((len(self.offset), 2))
+        return np.column_stack((zero, self.log_blur - _USUAL_LOG_BLUR, self.shading))
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePixels:
+    """Pixels by stretch, padded: shape (stretches, n) each. The stretches of an edge follow each other."""
+
+    grey: Float
+    depth: Float
+    """Distance from the first guess of the edge, px, positive inside the pipe."""
+    along: Float
+    weight: Float
+    """0 for padding."""
+    half_width: Float
+    """(stretches,), half the pipe's width."""
+    evenness: Float
+    """(stretches,), white noise over how much the pipe's own grey value varies from stretch to stretch."""
+    edge: NDArray[np.int64]
+    """(stretches,), which edge a stretch belongs to."""
+    noise: float
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """First stretch of each edge."""
+        return np.nonzero(np.diff(self.edge, prepend=-1))[0]
+
+    def summed(self, values: Float) -> Float:
+        """Per edge, (stretches, ...) to (edges, ...)."""
+        return np.add.reduceat(values, self.starts, axis=0)
+
+    def only(self, edge: int) -> "EdgePixels":
+        keep = self.edge == edge
+        grey, depth, along, weight = (t[keep] for t in (self.grey, self.depth, self.along, self.weight))
+        of_one = np.zeros(len(grey), np.int64)
+        return EdgePixels(grey, depth, along, weight, self.half_width[keep], self.evenness[keep], of_one, self.noise)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeModel:
+    """The model at a state, each stretch's own levels projected out."""
+
+    jacobian: Float
+    """(stretches, n, 3 + shading terms): offset, turn, log blur, shading."""
+    residual: Float
+    """(stretches, n)"""
+    shift: Float
+    """(stretches,), where each alone would put the edge, px from the line."""
+    shift_sigma: Float
+    squares: Float
+    """(stretches,), sum of squared residuals."""
+    variance: Float
+
+    def where(self, taken: NDArray[np.bool_], other: "EdgeModel") -> "EdgeModel":
+        """This model for the stretches that are taken, the other's for the rest."""
+        one, three = taken[:, None], taken[:, None, None]
+        return EdgeModel(
+            np.where(three, self.jacobian, other.jacobian),
+            np.where(one, self.residual, other.residual),
+            np.where(taken, self.shift, other.shift),
+            np.where(taken, self.shift_sigma, other.shift_sigma),
+            np.where(taken, self.squares, other.squares),
+            np.where(taken, self.variance, other.variance),
+        )
+
+
+def _limb_table() -> tuple[Float, Float]:
+    """sqrt(max(x, 0)) blurred by a Gaussian of sigma 1, tabulated."""
+    x = np.linspace(-6.0, 24.0, 1201)
+    fine = np.linspace(-6, 6, 2401)
+    kernel = np.exp(-0.5 * fine**2)
+    return x, (np.sqrt(np.maximum(x[:, None] - fine[None, :], 0)) @ kernel) / kernel.sum()
+
+
+_LIMB_X, _LIMB_Y = _limb_table()
+_LIMB_SLOPE = np.gradient(_LIMB_Y, _LIMB_X)
+
+
+def linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
+    edge = pixels.edge
+    blur = np.exp(state.log_blur)[edge, None]
+    tau = pixels.depth + state.offset[edge, None] - state.turn[edge, None] * pixels.along
+    x = tau / blur
+    step = ndtr(x)
+    bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    shading, by_depth, by_width = _shading(tau, pixels.along, blur, pixels.half_width[:, None])
+    coefficients = state.shading[edge, :, None]
+    ramp = -tau * (1 - step) + blur * bell
+    basis = np.stack((1 - step, ramp, step), axis=2) * pixels.weight[..., None]
+    # The pipe's grey value goes on along it, to within its own stains: one row more holds each stretch's deviation.
+    basis = np.pad(basis, ((0, 0), (0, 1), (0, 0)))
+    basis[:, -1, 2] = pixels.evenness
+    turned = basis.transpose(0, 2, 1)
+    solver = np.linalg.inv(turned @ basis + 1e-9 * np.eye(3)) @ turned
+    wanted = np.pad((pixels.grey - (shading @ coefficients)[..., 0]) * pixels.weight, ((0, 0), (0, 1)))
+    level = (solver @ wanted[..., None])[..., 0]
+    residual = wanted - (basis @ level[..., None])[..., 0]
+    jump = (level[:, 2] - level[:, 0])[:, None]
+    slope = level[:, 1][:, None]
+    by_tau = jump * bell / blur - slope * (1 - step) + (by_depth @ coefficients)[..., 0]
+    by_blur = -jump * bell * x + slope * bell * blur + (by_width @ coefficients)[..., 0]
+    jacobian = np.concatenate((np.stack((by_tau, -by_tau * pixels.along, by_blur), axis=2), shading), axis=2)
+    jacobian = np.pad(jacobian * pixels.weight[..., None], ((0, 0), (0, 1), (0, 0)))
+    jacobian = jacobian - basis @ (solver @ jacobian)
+    freedom = np.maximum(pixels.weight.sum(axis=1) - 4, 1)
+    squares = (residual**2).sum(axis=1)
+    variance = np.maximum(squares / freedom, pixels.noise**2)
+    strength = np.maximum((jacobian[..., 0] ** 2).sum(axis=1), 1e-9)
+    shift = (jacobian[..., 0] * residual).sum(axis=1) / strength
+    return EdgeModel(jacobian, residual, shift, np.sqrt(variance / strength), squares, variance)
+
+
+def _shading(tau: Float, along: Float, blur: Float, half_width: Float) -> tuple[Float, Float, Float]:
+    """What the shading inside may look like, blurred: terms, derivatives by depth and by log blur, (..., terms) each.
+
+    The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
+    shadow or a highlight begins, stand for the rest.
+    """
+    scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
+    x = tau / blur
+    here = along / _TREND_PX
+    bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+    inside = [(ndtr(x), bell / blur, -bell * x)]
+    inside.append(tuple(value * here for value in inside[0]))
+    root = scale * np.interp(x, _LIMB_X, _LIMB_Y)
+    root_slope = scale * np.interp(x, _LIMB_X, _LIMB_SLOPE) / blur
+    terms, by_depth, by_width = (list(values) for values in zip(*inside, strict=True))
+    terms.append(root)
+    by_depth.append(root_slope)
+    by_width.append(0.5 * root - root_slope * tau)
+    for start in _KINKS_PX:
+        y = (tau - start) / blur
+        bell = np.exp(-0.5 * y**2) / np.sqrt(2 * np.pi)
+        terms.append(((tau - start) * ndtr(y) + blur * bell) / half_width)
+        by_depth.append(ndtr(y) / half_width)
+        by_width.append(blur * bell / half_width)
+    return np.stack(terms, axis=-1), np.stack(by_depth, axis=-1), np.stack(by_width, axis=-1)

@@ -1,0 +1,53 @@
+"""Front ends in a process of their own see the same as in this one, and their end is told whatever it was."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from surecut.estimator.optimise import rig_of
+from surecut.estimator.sensed_log import SensedElsewhere, SensedHere, opened
+from surecut.factors.errors import LogError, SurecutError
+from surecut.io.reader import LogReader
+
+SAMPLE = Path(__file__).parents[1] / "logs" / "sample.mcap"
+
+
+def rig():
+    with LogReader(SAMPLE) as reader:
+        return rig_of(reader, None)
+
+
+def test_another_process_sees_the_same():
+    with opened(SAMPLE, rig(), 1) as here, opened(SAMPLE, rig(), 2) as elsewhere:
+        count = 0
+        for one, other in zip(here, elsewhere, strict=True):
+            count += 1
+            assert one.stamp_ns == other.stamp_ns
+            assert (one.pair is None) == (other.pair is None)
+            assert one.cameras.keys() == other.cameras.keys()
+            if one.bundle.frame is not None and other.bundle.frame is not None:
+                np.testing.assert_array_equal(one.bundle.frame.track_ids, other.bundle.frame.track_ids)
+                np.testing.assert_array_equal(one.bundle.frame.left_px, other.bundle.frame.left_px)
+            for a, b in zip(one.bundle.sightings, other.bundle.sightings, strict=True):
+                np.testing.assert_array_equal(a.corners_px, b.corners_px)
+        assert count > 10
+        assert here.report == elsewhere.report
+        assert elsewhere.report.sha256
+
+
+def test_an_error_of_the_front_ends_comes_across(tmp_path):
+    broken = tmp_path / "no.mcap"
+    broken.write_bytes(b"this is no recording" * 50)
+    with SensedElsewhere(broken, rig()) as recording, pytest.raises(LogError, match="not an MCAP"):
+        list(recording)
+    with SensedHere(broken, rig()) as recording, pytest.raises(LogError, match="not an MCAP"):
+        list(recording)
+
+
+def test_a_killed_process_is_told():
+    with SensedElsewhere(SAMPLE, rig()) as recording:
+        assert recording._process is not None
+        recording._process.kill()
+        with pytest.raises(SurecutError, match=r"sample.mcap: the process that reads it was killed \(exit code -9\)"):
+            list(recording)
