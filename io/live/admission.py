@@ -72,6 +72,11 @@ class Admission:
         """Whether anybody asked for the topic."""
         return self._expected is None or topic in self._expected
 
+    def forget_senders(self) -> None:
+        """The next sender on each topic is the one."""
+        for known in self._topics.values():
+            known.sender = ""
+
     def refusal(self, message: Message, sender: str, received_ns: int) -> str | None:
         """Why a message is not let in, as the name of a counter; None: it is.
 

@@ -46,6 +46,19 @@ class Intake:
         """Whether anybody asked for the topic."""
         return self._admission.wanted(topic)
 
+    def accepts(self, channel: ChannelInfo) -> bool:
+        """Whether it is worth asking for a channel; counts what cannot be understood, once."""
+        if not self.wanted(channel.topic) or len(channel.topic) > _MAXIMUM_NAME:
+            return False
+        decoder = self._decoder(channel)
+        if isinstance(decoder, str):
+            self.tally.add(decoder, channel.topic)
+        return not isinstance(decoder, str)
+
+    def forget_senders(self) -> None:
+        """The link was opened anew: whoever sent on a topic may have another name now."""
+        self._admission.forget_senders()
+
     def take(self, channel: ChannelInfo, data: bytes, sender: str = "", sent_ns: int = 0) -> None:
         """One message as it came. Never raises.
 

@@ -112,6 +112,7 @@ class McapStream:
         """
         rules = Untrusted(self._intake.limits.message_bytes, self._damaged, resynchronise=self._target is None)
         channels = _Channels(self._intake.limits.channels)
+        self._intake.forget_senders()
         any_record = False
         for record in RecordStream(stream, self.name, with_crc=False, untrusted=rules):
             any_record = True
