@@ -35,7 +35,7 @@ from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
 from .observability import why_no_base
-from .odometry import FramePose, Odometry, OdometrySettings
+from .odometry import Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .placement import place
 from .surfaces import Associator, Surfaces, SurfaceSettings
@@ -89,6 +89,8 @@ class Engine:
         """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
         self._unsolved = 0
         """Keyframes since the last update."""
+        self.astray = False
+        """The map is from an earlier run, and the camera has not found itself in it."""
         self.end_ns = 0
 
     # The loop -------------------------------------------------------------------------------------------------
@@ -179,8 +181,12 @@ class Engine:
 
     def _insert_keyframe(self, bundle: Bundle) -> None:
         if bundle.frame is not None:
+            placed = self._relocalised(bundle) if self.astray else None
+            if self.astray and placed is None:
+                return
+            self.astray = False
             index = self.odometry.last_keyframe + 1
-            update, rejected = self.odometry.insert(bundle.frame)
+            update, rejected = self.odometry.insert(bundle.frame, placed)
             self.rejected += rejected
             self._take(update)
         else:
@@ -196,6 +202,27 @@ class Engine:
         if bundle.frame is not None:
             self.flush()
             self._lay_landmarks(index)
+
+    def _relocalised(self, bundle: Bundle) -> gtsam.Pose3 | None:
+        """Where the camera stands in the map of an earlier run, by the boards that it sees."""
+        if not _mobile(bundle):
+            return None
+        return place(self.boards, self.state, bundle.sightings, (gtsam.Pose3(), 1 << 62))
+
+    def promote(self, bundle: Bundle) -> bool:
+        """Makes a frame of the recent past a keyframe, because somebody clicked in it; False where that is too late."""
+        if bundle.frame is None or bundle.stamp_ns in self.keyframe_at:
+            return bundle.stamp_ns in self.keyframe_at
+        found = self.odometry.insert_late(bundle.frame)
+        if found is None:
+            return False
+        self.rejected += found[1]
+        self._take(found[0])
+        index = self.odometry.last_keyframe
+        self.keyframe_at[bundle.stamp_ns] = index
+        self._see_boards(keys.keyframe(index), bundle)
+        self.flush()
+        return True
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = _mobile(bundle)
@@ -230,13 +257,14 @@ class Engine:
         update.guess(key, pose)
         if index == 0:
             update.add(gauge_prior(key), Record("gauge", "gauge", bundle.stamp_ns, "origin {o}", rejectable=False))
-        self.odometry.keyframe_stamps.append(bundle.stamp_ns)
-        self.odometry.frames.append(FramePose(bundle.stamp_ns, index, np.eye(4)))
+        self.odometry.place(bundle.stamp_ns, index)
         self._take(update)
         return index
 
     def _nearest(self, stamp_ns: int) -> tuple[gtsam.Pose3, int]:
         """The keyframe nearest in time: its pose, and how far it is, ns."""
+        if not self.keyframe_at:
+            return gtsam.Pose3(), 1 << 62
         nearest = min(self.keyframe_at, key=lambda stamp: abs(stamp - stamp_ns))
         return self.state.pose(keys.keyframe(self.keyframe_at[nearest])), abs(nearest - stamp_ns)
 
@@ -362,6 +390,11 @@ class Engine:
             return None
         return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
 
+    def take_picks(self, bundle: Bundle) -> None:
+        """Clicks in a keyframe that is in the graph already."""
+        self._picks_of(bundle)
+        self.flush()
+
     def _picks_of(self, bundle: Bundle) -> None:
         for pick in bundle.picks:
             self._pick(pick, bundle.depths_m.get(pick.point_id))
@@ -425,6 +458,33 @@ class Engine:
         ]
 
     # A run without end ----------------------------------------------------------------------------------------
+
+    def unsolved(self) -> bool:
+        """Are there factors that have not been through the solver?"""
+        return not self._pending.empty()
+
+    @property
+    def mounted(self) -> bool:
+        """Is the taped mount in the graph?"""
+        return self._mounted
+
+    @property
+    def distances_open(self) -> list[Distance]:
+        """Known distances that have not entered, because a point of them has not been seen."""
+        return list(self._distances_open)
+
+    def resume(self, memory: Update, keyframes: int, mounted: bool, distances_open: list[Distance]) -> None:
+        """Goes on from what an earlier run knew, in the same {o}; the camera has to find itself again.
+
+        Args:
+            memory: the variables that live on, and one factor with all that is known about them.
+            keyframes: how many the earlier run made; new ones count on from there.
+        """
+        self.state.values = self.solver.update(memory)
+        self.odometry.keyframe_stamps = [0] * max(keyframes, 1)
+        self._mounted = mounted
+        self._distances_open = distances_open
+        self.astray = True
 
     def held_keyframes(self) -> set[int]:
         """Keys of keyframes on which measurements hang that have not entered the graph."""

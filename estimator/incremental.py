@@ -93,6 +93,10 @@ class Incremental:
             self._isam.update(graph, values)
         self._values = self._isam.calculateEstimate()
 
+    def switch_off(self, remove: Iterable[int]) -> gtsam.Values:
+        """Takes factors out again, by their places in the log."""
+        return self.update(Update(), remove)
+
     def reduce(self, leaving: Collection[int], dropped: Collection[int], stamp_ns: int) -> gtsam.Values:
         """Takes variables out of the graph and starts iSAM2 anew on the rest.
 

@@ -37,6 +37,15 @@ class Pipeline:
         if sensed.cloud is not None:
             engine.add(Bundle(sensed.stamp_ns, cloud=sensed.cloud))
 
+    def look_back(self, sensed: Sensed) -> bool:
+        """Clicks in a frame that was taken in before: it becomes a keyframe. False where that is too late."""
+        if not self.engine.promote(sensed.bundle) or sensed.pair is None:
+            return False
+        self.engine.pick_images.update(sensed.clicked)
+        self.engine.take_picks(sensed.bundle)
+        self._outlines.see(sensed.pair, sensed.bundle.picks)
+        return True
+
     def check(self, report: SensingReport) -> None:
         """After the last message: is there anything to estimate from, and was everything understood?
 

@@ -58,6 +58,24 @@ class _Cylinder:
     outlines: int = 0
 
 
+def known_point(
+    index: int,
+    name: str,
+    role: str,
+    pipe: str | None,
+    on_axis: bool,
+    picks: int,
+    stamp_ns: int,
+) -> _Point:
+    """A point that an earlier run knew."""
+    return _Point(index, name, role, pipe, known=True, on_axis=on_axis, picks=picks, stamp_ns=stamp_ns)
+
+
+def known_cylinder(index: int, pipe: Pipe, outlines: int) -> _Cylinder:
+    """A pipe that an earlier run knew."""
+    return _Cylinder(index, pipe, known=True, outlines=outlines)
+
+
 class Pipes:
     """All pipe points and pipes of one run."""
 

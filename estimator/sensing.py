@@ -1,14 +1,15 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TypeGuard
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
-from ..factors.measurements import CloudFrame, MarkerSighting, Pick, Rejection
+from ..factors.measurements import CloudFrame, MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
@@ -19,6 +20,7 @@ from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
 
 Item = Message | StereoPair
+Tracked = Callable[[StereoFrame], object]
 
 COMPRESSED = "/compressed"
 COLOUR_PERIOD_NS = 1_000_000_000
@@ -90,17 +92,23 @@ class Sensing:
 
     def groups(self, messages: Iterable[Message]) -> Iterator[list[Item]]:
         """Messages by stamp: sorted, stereo images paired, those of one stamp together."""
-        ordered = sorted_by_stamp((_plain(m) for m in messages), report=self._order)
+        ordered = sorted_by_stamp((plain(m) for m in messages), report=self._order)
         left, right = self.rig.cameras.m_left.image_topic, self.rig.cameras.m_right.image_topic
         return _same_stamp(stereo_pairs(ordered, left, right, report=self._pairing))
 
-    def process(self, group: list[Item]) -> Sensed:
-        """All messages of one stamp."""
+    def process(self, group: list[Item], tracked: Tracked | None = None) -> Sensed:
+        """All messages of one stamp.
+
+        Args:
+            tracked: told of the frame's motion at once, before anything else is looked for.
+        """
         stamp_ns = _stamp(group[0])
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
         picks = tuple(self._pick(i) for i in group if isinstance(i, Message) and isinstance(i.body, PickBody))
         frame = self.sensors.track(pair) if pair is not None else None
+        if frame is not None and tracked is not None:
+            tracked(frame)
         kept = pair if frame is not None and (frame.is_keyframe or picks or not self._started) else None
         self._started |= frame is not None
         sightings = self._sightings(stamp_ns, group, kept)
@@ -116,6 +124,23 @@ class Sensing:
             self._clicked(picks, pair, group),
             fresh,
         )
+
+    def look_back(self, click: Message, pair: PairImages, frame: StereoFrame) -> Sensed:
+        """A click in a frame that has been processed before: what it needs to be a keyframe after all.
+
+        Raises:
+            LogError: the click cannot be used.
+        """
+        pick = self._pick(click)
+        depth = self.sensors.depth_under(pick, pair)
+        sightings = [] if frame.is_keyframe else self._sightings(frame.stamp_ns, [], pair)
+        depths = {} if depth is None else {pick.point_id: depth}
+        bundle = Bundle(frame.stamp_ns, frame, tuple(sightings), (pick,), depths)
+        return Sensed(bundle, pair=pair, clicked=self._clicked((pick,), pair, []))
+
+    def is_calibration(self, item: Item) -> TypeGuard[Message]:
+        """Is it a calibration of one of the cameras?"""
+        return isinstance(item, Message) and isinstance(item.body, CameraInfoBody) and item.topic in self._info
 
     def report(self) -> SensingReport:
         """What was odd, and what was refused, so far."""
@@ -202,7 +227,7 @@ def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def _plain(message: Message) -> Message:
+def plain(message: Message) -> Message:
     """A compressed topic counts as its raw one."""
     if not message.topic.endswith(COMPRESSED):
         return message

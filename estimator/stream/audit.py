@@ -1,0 +1,50 @@
+"""From time to time: does the model agree with its own data, and how far do correlated tracks widen the answer?"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...factors import keys
+from ..consistency import family_tests, judge, prior_tests
+from ..correlation import inflated_system
+from ..engine import Engine
+from ..marginal import FAMILY
+from ..odometry import FAMILY as ODOMETRY
+from ..points_in_base import point_blocks
+from ..result import Consistency
+
+TESTED = ("mount", "known distances", "board geometry", "calibration priors")
+NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """The outcome."""
+
+    consistency: Consistency = NOT_TESTED
+    widening: Mapping[str, float] = field(default_factory=dict)
+    """By point: factor on its covariance, at least 1."""
+
+
+def audit(engine: Engine) -> Audit:
+    """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
+    mostly made of them, and cannot be told apart any more."""
+    values, log = engine.state.values, engine.solver.log
+    active = list(log.active())
+    system, inflation = inflated_system(active, values, ODOMETRY)
+    earlier = np.array([record.family == FAMILY for _, _, record in active])
+    system.inflation[np.repeat(earlier, system.rows)] = inflation
+    families = family_tests(log, active, system, values, engine.rig.gates.robust_sigma)
+    consistency = judge(tuple(f for f in families if f.family != FAMILY), prior_tests(active, system, TESTED), {})
+    widening = {}
+    if values.exists(keys.base(0)):
+        for point in engine.pipes.points.values():
+            if point.known:
+                _, blocks = point_blocks(values, keys.base(0), keys.point(point.index))
+                wide = np.trace(system.covariance(blocks))
+                system_inflation, system.inflation = system.inflation, np.ones_like(system.inflation)
+                plain = np.trace(system.covariance(blocks))
+                system.inflation = system_inflation
+                widening[point.id] = max(float(wide / plain), 1.0)
+    return Audit(consistency, widening)
