@@ -57,7 +57,7 @@ sys.path.insert(0, sys.argv[2])
 from pathlib import Path
 from live_helpers import live_image, update
 from surecut.io.live.recorder import Recorder
-recorder = Recorder(Path(sys.argv[1]), images=True)
+recorder = Recorder(Path(sys.argv[1]), images=True, flush_s=0.25)
 recorder.start()
 number = 0
 while True:
@@ -81,7 +81,7 @@ def test_after_kill_9_all_but_the_last_second_is_there(tmp_path: Path):
     for process in processes:
         assert process.stdout is not None
         process.stdout.readline()  # it writes
-    time.sleep(1.3)
+    time.sleep(1.5)
     for process, path in zip(processes, paths, strict=True):
         time.sleep(chance.uniform(0.1, 0.7))
         process.kill()
@@ -94,7 +94,7 @@ def test_after_kill_9_all_but_the_last_second_is_there(tmp_path: Path):
         stamps = {m.stamp_ns for m in reader if m.topic == "/estimate/points"}
         assert len(reader.warnings) == 1
         for number, at in written:
-            if float(at) < killed_at - 1.2:  # a second, and what writing takes
+            if float(at) < killed_at - 1.2:  # a quarter of a second, and a machine that is busy
                 assert update(int(number)).stamp_ns in stamps
     assert len(stamps) > 50
 

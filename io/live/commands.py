@@ -158,7 +158,7 @@ class CommandDesk:
 
     def _unauthorised(self) -> Reply:
         self._tally.add("unauthorised")
-        return Reply(False, "the token is missing or wrong")
+        return Reply(False, "the token is missing or wrong", unauthorised=True)
 
     def _malformed(self, text: str) -> Reply:
         self._tally.add("malformed")

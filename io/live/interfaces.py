@@ -237,6 +237,8 @@ class Reply:
 
     accepted: bool
     text: str
+    unauthorised: bool = False
+    """Refused for want of the token."""
 
 
 OnCommand = Callable[[Command], Reply]
