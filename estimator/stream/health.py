@@ -5,6 +5,8 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ...factors.rig import Rig
 from ...io.live.interfaces import Fault, Health, HealthState, Severity
 from ...io.messages import CameraInfoBody, DepthBody, ImageBody, Message
@@ -75,7 +77,7 @@ class Monitor:
         if message.stamp_ns > 0 and not isinstance(message.body, CameraInfoBody):
             self._clock(message.topic, topic, message.stamp_ns - now_ns, now_ns)
         if isinstance(message.body, ImageBody | DepthBody):
-            found = zlib.crc32(message.body.source.data)
+            found = zlib.crc32(np.ascontiguousarray(message.body.source.data).data)
             topic.same = topic.same + 1 if found == topic.print else 0
             topic.print = found
 
@@ -173,7 +175,9 @@ class Monitor:
     def _pairs(self) -> list[tuple[str, str, Severity]]:
         if self._unpaired < self._settings.unpaired_share:
             return []
-        text = f"{100 * self._unpaired:.0f} % of the stereo images have no partner of their moment; synchronise the pair"
+        text = (
+            f"{100 * self._unpaired:.0f} % of the stereo images have no partner of their moment; synchronise the pair"
+        )
         return [("pair_apart", text, Severity.ERROR)]
 
     def _refused(self, now_ns: int) -> list[tuple[str, str, Severity]]:
