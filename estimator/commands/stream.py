@@ -1,4 +1,4 @@
-"""Estimate live, from sensors or a replay, with the numbers of `optimise`: to viewers, robot and files, for hours."""
+"""Estimate live, from sensors or a replay, with the numbers of `optimise`; to viewers, robot and files."""
 
 import signal
 from collections.abc import Mapping
@@ -78,7 +78,7 @@ def command(
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="At the end: the last answer and all counters.")] = None,
 ) -> None:
-    """Estimate live, from sensors or a replay, with the numbers of `optimise`: to viewers, robot and files, for hours."""
+    """Estimate live, from sensors or a replay, with the numbers of `optimise`; to viewers, robot and files."""
     rig_data = _rig(rig, replay)
     sources = _sources(rig_data, zenoh, zenoh_domain, foxglove or [], mcap or [], replay, rate, loop)
     access = Access(host, allow_remote, token)

@@ -15,6 +15,8 @@ from ..points_in_base import point_blocks
 from ..result import Consistency
 
 TESTED = ("mount", "known distances", "board geometry", "calibration priors")
+SETTLE_ROUNDS = 3
+"""Relinearisations before the residuals are judged: those at an old linearisation are not the data's."""
 NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
 
 
@@ -30,6 +32,7 @@ class Audit:
 def audit(engine: Engine) -> Audit:
     """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
     mostly made of them, and cannot be told apart any more."""
+    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     values, log = engine.state.values, engine.solver.log
     active = list(log.active())
     system, inflation = inflated_system(active, values, ODOMETRY)

@@ -13,7 +13,7 @@ from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
 from .settings import StreamSettings
-from .wire import Died, Done, LateClick, Order
+from .wire import Died, Done, LateClick, Order, Ready
 
 BUSY = 20
 """Stamps that wait from which on answers are rarer."""
@@ -35,6 +35,7 @@ def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     try:
         loop = _started(task, out, task.prior)
+        out.put(Ready("graph"))
         while True:
             try:
                 item = inbox.get(timeout=0.5)

@@ -19,7 +19,7 @@ from ...io.pairing import StereoPair
 from ..sensing import Item, Sensing, images
 from ..sensors import PairImages
 from .settings import StreamSettings
-from .wire import Died, Frame, Group, LateClick, Order, Worked
+from .wire import Died, Frame, Group, LateClick, Order, Ready, Worked
 
 
 def sense(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) -> None:
@@ -27,6 +27,7 @@ def sense(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) 
     cv2.setNumThreads(1)
     try:
         loop = SenseLoop(rig, settings, graph, out)
+        out.put(Ready("front ends"))
         while True:
             item = inbox.get()
             if isinstance(item, Group):

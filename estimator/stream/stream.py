@@ -36,7 +36,7 @@ from .latency import Latencies
 from .ordering import LiveOrder
 from .publisher import update_of
 from .settings import StreamSettings
-from .wire import Answer, Died, Done, Frame, Group, Order, Worked
+from .wire import Answer, Died, Done, Frame, Group, Order, Ready, Worked
 
 TICK_S = 0.02
 IDLE_PUBLISH_NS = 500_000_000
@@ -44,6 +44,7 @@ IDLE_PUBLISH_NS = 500_000_000
 RESTARTS = 5
 """More within a minute: the fault does not go away by itself."""
 FINISH_S = 120.0
+START_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +103,7 @@ class Stream:
         self._published_at = 0
         self._stopping = threading.Event()
         self._finished = threading.Event()
+        self._ready = threading.Event()
         self._deaths: list[float] = []
         self.problem: str | None = None
         """Why the stream ended, where it should not have."""
@@ -124,6 +126,7 @@ class Stream:
         try:
             for sink in self._sinks:
                 sink.start(self._commanded)
+            self._wait_for_children()
             for source in self._sources:
                 source.start(self._deliver_to(source))
             while not self._stopping.is_set():
@@ -141,6 +144,16 @@ class Stream:
                 sink.stop()
         if self.problem is not None:
             raise SurecutError(self.problem)
+
+    def _wait_for_children(self) -> None:
+        """Messages that come before anybody can work on them would only be old when they are."""
+        until = time.monotonic() + START_S
+        while not self._ready.wait(0.1) and not self._stopping.is_set():
+            dead = self._children.dead()
+            if dead is not None or time.monotonic() > until:
+                raise SurecutError(
+                    f"the {dead or 'processes'} did not start; {self.last_problem or 'is there memory?'}"
+                )
 
     def stop(self) -> None:
         """Ends the run; from any thread or signal handler."""
@@ -273,6 +286,7 @@ class Stream:
     # Results (own thread) -------------------------------------------------------------------------------------
 
     def _results(self) -> None:
+        ready: frozenset[str] = frozenset()
         while True:
             said = self._children.out.get()
             if isinstance(said, Frame):
@@ -283,6 +297,10 @@ class Stream:
                 self._worked(said)
             elif isinstance(said, Done):
                 self._done(said)
+            elif isinstance(said, Ready):
+                ready = ready | {said.who}
+                if len(ready) == 2:
+                    self._ready.set()
             elif isinstance(said, Died):
                 self.last_problem = f"{said.who}: {said.trace}"
                 self._count("deaths")

@@ -109,6 +109,13 @@ class Done:
 
 
 @dataclass(frozen=True, slots=True)
+class Ready:
+    """A process has loaded what it needs."""
+
+    who: str
+
+
+@dataclass(frozen=True, slots=True)
 class Died:
     """A process ends by something that should not have happened."""
 
