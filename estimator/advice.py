@@ -201,11 +201,11 @@ def _predict(
     joint = Joint.of(system, sorted(touched & set(system.columns)))
     best: dict[str, dict[str, Advice]] = defaultdict(dict)
     for plan in plans:
-        after = joint.with_rows(joint.rows(plan.factors, planner.all_values(plan)))
+        rows = joint.rows(plan.factors, planner.all_values(plan))
         for p in points:
             if plan.point not in (None, p.id):
                 continue
-            told = _told(p, plan.action, plan.detail, after.of_blocks(blocks[p.id]))
+            told = _told(p, plan.action, plan.detail, joint.after(rows, blocks[p.id]))
             if plan.kind not in best[p.id] or told.gain > best[p.id][plan.kind].gain:
                 best[p.id][plan.kind] = told
     return {p.id: list(best[p.id].values()) for p in points}

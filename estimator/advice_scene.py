@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from ..factors.cloud import corrected
+from ..factors.cloud import corrected, depth_states
 from .engine import Engine
 from .graph import Record
 from .odometry import FAMILY as ODOMETRY
@@ -81,7 +81,7 @@ class Surroundings:
         if cloud is None or not self.values.exists(base) or not self.values.exists(keys.DEPTH):
             return self.points
         o_T_b = self.values.atPose3(base)
-        b_p = corrected(cloud.points_m, *self.values.atVector(keys.DEPTH))
+        b_p = corrected(cloud.points_m, *depth_states(self.values))
         return np.vstack([self.points, b_p @ o_T_b.rotation().matrix().T + o_T_b.translation()])
 
     def sigma(self, family: str, camera: str, default: float) -> float:

@@ -1,7 +1,7 @@
 """What further measurements would do to a covariance: predicted factors added to the linearised graph."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import gtsam
@@ -57,24 +57,20 @@ class Joint:
         weight = X[selected]
         return cls(columns, 0.5 * (weight + weight.T), X.T @ (middle @ X))
 
-    def of_blocks(self, blocks: Blocks) -> Float:
-        """Covariance of `J x`, J given by blocks (key, shape (m, dim))."""
-        J = self._jacobian(blocks)
-        return J @ self.covariance @ J.T
-
-    def with_rows(self, rows: Rows) -> Self:
-        """The joint after further measurements.
+    def after(self, rows: Rows, blocks: Blocks) -> Float:
+        """Covariance of `J x` after further measurements.
 
         The estimator weighs them by the gain G = P W^T (W P W^T + I)^-1 with the weights P that it has; the error of
         the new estimate is (I - G W) e + G n, so its covariance is (I - G W) S (I - G W)^T + G C G^T (Joseph's form).
+        Only J times that is formed.
         """
-        W, P = rows.W, self.weight
+        J, W, P = self._jacobian(blocks), rows.W, self.weight
         if len(W) == 0:
-            return self
-        G = np.linalg.solve(W @ P @ W.T + np.eye(len(W)), W @ P).T
-        K = np.eye(len(P)) - G @ W
-        weight = K @ P @ K.T + G @ G.T
-        return replace(self, weight=weight, covariance=K @ self.covariance @ K.T + G @ rows.C @ G.T)
+            return J @ self.covariance @ J.T
+        WP = W @ P
+        JG = np.linalg.solve(WP @ W.T + np.eye(len(W)), WP @ J.T).T
+        JK = J - JG @ W
+        return JK @ self.covariance @ JK.T + JG @ rows.C @ JG.T
 
     def rows(self, predicted: Sequence[Predicted], values: gtsam.Values) -> Rows:
         """Linearises factors at the estimate; variables that the joint does not hold are new and eliminated.
@@ -151,5 +147,4 @@ def measured_again(system: LinearSystem, rows: NDArray[np.bool_], times: float, 
     middle = csr_matrix(system.A.T @ diags(system.inflation) @ system.A)
     joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, X.T @ (middle @ X))
     select = np.hstack([np.zeros((len(W), J.shape[1])), np.eye(len(W))])
-    after = joint.with_rows(Rows(select, np.diag(system.inflation[rows])))
-    return after.covariance[: J.shape[1], : J.shape[1]]
+    return joint.after(Rows(select, np.diag(system.inflation[rows])), [(0, np.eye(J.shape[1], right.shape[1]))])

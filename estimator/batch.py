@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.measurements import Rejection
-from ..factors.noise import huber_norm, robust_scale
+from ..factors.noise import robust_scale
 from .graph import FactorLog, Record
-from .linear import LinearSystem, deviate
+from .linear import deviate
+from .linearised import Linearised, linearise, with_correlated_tracks
 from .observability import determined
+from .odometry import FAMILY as ODOMETRY
 
 Float = NDArray[np.float64]
 
@@ -35,27 +37,30 @@ class BatchSolution:
     """Indices of factors that were taken out."""
     rejected: tuple[Rejection, ...]
     iterations: int
+    at: Linearised
+    """The factors that are left, at the solution."""
 
 
 def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
     """Robust Levenberg-Marquardt; then what is beyond noise is taken out, first by its residual, then by snooping."""
     first, iterations = _optimise(log.graph(), start)
-    values = first
     off: set[int] = set()
     rejected: list[Rejection] = []
+    at = linearise(log, off, first, robust_sigma)
     for finder, rounds in ((outliers, 3), (snooped, SNOOPING_ROUNDS)):
         for _ in range(rounds):
-            found = finder(log, values, robust_sigma, off)
+            found = finder(at)
             if not found:
                 break
-            rejected += [r for _, r in found]
             off |= {i for i, _ in found}
-            alone = orphans(log, off)
-            rejected += [r for _, r in alone]
-            off |= {i for i, _ in alone}
-            values, more = _optimise(_without(log, off), values)
+            found += orphans(at, off)
+            off |= {i for i, _ in found}
+            rejected += [r for _, r in found]
+            values, more = _optimise(_without(log, off), at.values)
+            at = linearise(log, off, values, robust_sigma)
             iterations += more
-    return BatchSolution(values, first, tuple(sorted(off)), tuple(rejected), iterations)
+    at = with_correlated_tracks(at, ODOMETRY)
+    return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
@@ -78,37 +83,30 @@ def _without(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def residual_norm(factor: gtsam.NonlinearFactor, values: gtsam.Values, robust_sigma: float, rejectable: bool) -> float:
-    """Norm of the whitened residual, the robust loss undone."""
-    loss = factor.error(values)
-    if not rejectable:
-        return float(np.sqrt(2.0 * loss))
-    return huber_norm(loss, robust_scale(robust_sigma, factor.dim()))
-
-
-def outliers(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[int]) -> list[tuple[int, Rejection]]:
-    """Factors whose residual is beyond what noise explains."""
+def outliers(at: Linearised) -> list[tuple[int, Rejection]]:
+    """Factors whose residual is beyond what noise explains, and points that lie behind their camera."""
+    limit = np.array([robust_scale(OUTLIER_SIGMA, n) for n in range(1, int(at.system.rows.max()) + 1)])
+    limit = limit[at.system.rows - 1]
     found = []
-    for index, factor, record in log.active():
-        if index in off or not record.rejectable:
+    for position in np.flatnonzero((at.norms > limit) | (at.norms == 0.0)):
+        index, factor, record = at.active[position]
+        if not record.rejectable:
             continue
-        depth_m = landmark_depth(factor, record, values)
+        reason, norm, bound = "whitened residual", float(at.norms[position]), float(limit[position])
+        depth_m = landmark_depth(factor, record, at.values)
         if depth_m is not None and depth_m <= 0:
-            reason = "landmark behind the camera by m"
-            found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, -depth_m, 0.0)))
+            reason, norm, bound = "landmark behind the camera by m", -depth_m, 0.0
+        elif norm <= bound:
             continue
-        norm = residual_norm(factor, values, robust_sigma, True)
-        limit = robust_scale(OUTLIER_SIGMA, factor.dim())
-        if norm > limit:
-            reason = "whitened residual"
-            found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, norm, limit)))
+        found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, norm, bound)))
     return found
 
 
 def landmark_depth(factor: gtsam.NonlinearFactor, record: Record, values: gtsam.Values) -> float | None:
     """How far before the mobile camera a factor's landmark is; None for factors of anything else.
 
-    GTSAM's projection factors give the residual zero for a point behind the camera, so the residual cannot tell.
+    GTSAM's projection factors give a point behind the camera the residual zero or a huge one, so that the residual
+    cannot tell.
     """
     if record.camera not in ("m_left", "m_right"):
         return None
@@ -120,43 +118,38 @@ def landmark_depth(factor: gtsam.NonlinearFactor, record: Record, values: gtsam.
     return float(values.atPose3(pose).transformTo(values.atPoint3(landmark))[2])
 
 
-def orphans(log: FactorLog, off: set[int]) -> list[tuple[int, Rejection]]:
+def orphans(at: Linearised, off: set[int]) -> list[tuple[int, Rejection]]:
     """What is left of landmarks that the removal of outliers left with one view: it determines no point."""
-    views: dict[int, list[int]] = {}
-    for index, factor, record in log.active():
-        if index in off or record.camera is None:
-            continue
+    touching: dict[int, list[int]] = {}
+    for position, (_, factor, _) in enumerate(at.active):
         for key in factor.keys():
             if keys.kind(key) == "l":
-                views.setdefault(key, []).append(index)
-    lonely = {key for key, indices in views.items() if len(indices) < MINIMUM_VIEWS}
+                touching.setdefault(key, []).append(position)
     found = []
-    for index, factor, record in log.active():
-        if index not in off and lonely.intersection(factor.keys()):
-            left = float(max(len(views[key]) for key in factor.keys() if key in lonely))
+    for positions in touching.values():
+        left = [p for p in positions if at.active[p][0] not in off]
+        views = sum(at.active[p][2].camera is not None for p in left)
+        if len(left) == len(positions) or views >= MINIMUM_VIEWS:
+            continue
+        for index, _, r in (at.active[p] for p in left):
             reason = "too few good views of the landmark; views"
-            found.append((index, Rejection(record.stamp_ns, record.family, record.what, reason, left, MINIMUM_VIEWS)))
+            found.append((index, Rejection(r.stamp_ns, r.family, r.what, reason, float(views), MINIMUM_VIEWS)))
     return found
 
 
-def snooped(log: FactorLog, values: gtsam.Values, robust_sigma: float, off: set[int]) -> list[tuple[int, Rejection]]:
+def snooped(at: Linearised) -> list[tuple[int, Rejection]]:
     """The worst measurement of each small family by Baarda's test, where it is beyond the limit.
 
     A wrong measurement that few others control pulls the estimate and hides its residual. Its standardised residual
     r / sqrt(1 - h), with h its own block of the hat matrix, does not hide (Baarda 1968, data snooping). One per
     family and round, because one wrong measurement makes its neighbours look wrong.
     """
-    active = [(i, f, r) for i, f, r in log.active() if i not in off]
-    positions = [i for i, (_, _, r) in enumerate(active) if r.rejectable and r.family in SNOOPED]
+    positions = [i for i, (_, _, r) in enumerate(at.active) if r.rejectable and r.family in SNOOPED]
     if not positions:
         return []
-    graph = gtsam.NonlinearFactorGraph()
-    for _, factor, _ in active:
-        graph.add(factor)
-    system = LinearSystem(graph, values)
     worst: dict[str, tuple[float, int, Rejection]] = {}
-    for position, (total, dof) in zip(positions, system.standardised(positions), strict=True):
-        index, _, record = active[position]
+    for position, (total, dof) in zip(positions, at.system.standardised(positions), strict=True):
+        index, _, record = at.active[position]
         sigma = deviate(total, dof) if dof else 0.0
         if sigma > SNOOPING_SIGMA and sigma > worst.get(record.family, (0.0,))[0]:
             told = Rejection(

@@ -7,19 +7,18 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, hstack
-from scipy.stats import chi2, norm
 
 from ..factors import keys
 from ..factors.board import page_factor, print_scale_prior, shift_directions, side_prior
+from ..factors.chance import chi2_isf, normal_isf
 from ..factors.measurements import Event, Rejection
 from .batch import BatchSolution, solve
 from .boards import DISTANCES, FREE_SIDE_REL, GEOMETRY, scale_words, side_words
 from .corner_inset import Insets, corrected_corners, inset_directions
-from .correlation import Active, inflated_system
+from .correlation import Active
 from .engine import Engine
 from .graph import Record, Update
 from .linear import LinearSystem, deviate
-from .odometry import FAMILY as ODOMETRY
 from .result import CalibrationEstimate
 from .sheet import Knock, Sheet
 
@@ -64,6 +63,7 @@ class _Look:
     """One solution, linearised."""
 
     engine: Engine
+    solution: BatchSolution
     values: gtsam.Values
     active: Active
     system: LinearSystem
@@ -82,29 +82,27 @@ def settle_boards(engine: Engine, solution: BatchSolution) -> BatchSolution:
 
     A wrong statement pulls others with it, so that only the worst one is taken at a time (Baarda 1968).
     """
-    solution = _correct_insets(engine, solution)
+    look = _correct_insets(_look(engine, solution))
     done: set[tuple[str, str, int]] = set()
     for _ in range(ROUNDS):
-        found = [f for f in _faults(_look(engine, solution)) if f.name not in done]
+        found = [f for f in _faults(look) if f.name not in done]
         if not found:
             break
         worst = max(found, key=lambda f: f.excess)
         done.add(worst.name)
-        solution = _again(engine, solution, *_released(engine, worst, solution))
-    _tell(_look(engine, solution))
-    return solution
+        look = _look(engine, _again(engine, look.solution, *_released(engine, worst, look.solution)))
+    _tell(look)
+    return look.solution
 
 
 def _look(engine: Engine, solution: BatchSolution) -> _Look:
-    off = set(solution.outliers)
-    active = [row for row in engine.solver.log.active() if row[0] not in off]
-    system, _ = inflated_system(active, solution.values, ODOMETRY)
+    active, system = solution.at.active, solution.at.system
     names, sigmas, C = inset_directions(engine.solver.log, active, system, solution.values, engine.boards)
     sides = [side_words(sheet.board.id) for sheet in engine.boards.sheets.values()]
     priors = [p for p, (_, _, r) in enumerate(active) if r.what in sides]
     columns = [_column(system, p, -_noise(active[p][1]).whiten(np.ones(1))[:, None]) for p in priors]
     shift = system.shift(csr_matrix(hstack([C, *columns])))
-    return _Look(engine, solution.values, active, system, Insets(names, sigmas, shift), C)
+    return _Look(engine, solution, solution.values, active, system, Insets(names, sigmas, shift), C)
 
 
 def _noise(factor: gtsam.NonlinearFactor) -> Any:
@@ -129,11 +127,11 @@ def _again(engine: Engine, solution: BatchSolution, update: Update, remove: list
 # Corner inset -------------------------------------------------------------------------------------------------
 
 
-def _correct_insets(engine: Engine, solution: BatchSolution) -> BatchSolution:
+def _correct_insets(look: _Look) -> _Look:
     """Corners that lie inside their markers are moved out, where views of different size show by how much."""
-    look = _look(engine, solution)
+    engine = look.engine
     if not look.insets.names:
-        return solution
+        return look
     value, sigma = look.insets.by_size_alone()
     frozen = look.insets.frozen()
     told = (np.abs(value) > GATE_SIGMA * sigma) & ~frozen
@@ -151,9 +149,10 @@ def _correct_insets(engine: Engine, solution: BatchSolution) -> BatchSolution:
             values = {"inset_px": float(value[i]), "sigma_px": float(sigma[i])}
             engine.boards.say(engine.end_ns, "corner_inset", f"{board} {camera}", text, "info", **values)
     if not told.any():
-        return solution
+        return look
     moved = {name: float(value[i]) for i, name in enumerate(look.insets.names) if told[i]}
-    return _again(engine, solution, *corrected_corners(engine.solver.log, solution.values, moved))
+    corrected = corrected_corners(engine.solver.log, look.values, moved)
+    return _look(engine, _again(engine, look.solution, *corrected))
 
 
 # What contradicts ---------------------------------------------------------------------------------------------
@@ -229,7 +228,7 @@ def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
     value, covariance = shift.solution()
     total = float(value @ shift.information @ value)
     off = deviate(total, 3)
-    limit = float(norm.isf(MARKER_FALSE_ALARM / 2))
+    limit = normal_isf(MARKER_FALSE_ALARM / 2)
     length = float(np.linalg.norm(value[:2]))
     along = value[:2] / max(length, 1e-12)
     sigma = float(np.sqrt(along @ covariance[:2, :2] @ along))
@@ -243,7 +242,7 @@ def _no_knock(look: _Look, sheet: Sheet, knock: Knock) -> Fault | None:
     if moved is None or place is None:
         return None
     delta, covariance = moved
-    if delta @ np.linalg.solve(covariance, delta) > chi2.isf(KNOCK_FALSE_ALARM, 6):
+    if delta @ np.linalg.solve(covariance, delta) > chi2_isf(KNOCK_FALSE_ALARM, 6):
         return None
     return Fault("rejoined", 2e9, sheet, -1, place[2], knock.epoch)
 
@@ -308,7 +307,7 @@ def _rejoin(engine: Engine, sheet: Sheet, fault: Fault, update: Update) -> None:
 
 
 def _tell_loose(engine: Engine, fault: Fault) -> None:
-    board, limit = fault.sheet.board, float(norm.isf(MARKER_FALSE_ALARM / 2))
+    board, limit = fault.sheet.board, normal_isf(MARKER_FALSE_ALARM / 2)
     text = (
         f"board {board.id}: marker {fault.marker} is {1e3 * fault.shift_m:.1f} +/- {1e3 * fault.shift_sigma_m:.1f} mm "
         "off its place; its place on the page is not used"

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..factors.board import page_corners
 from ..factors.camera import CameraModel
+from ..factors.chance import chi2_isf
 from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.rig import Rig
@@ -147,7 +147,7 @@ class Inspection:
         fit = self._fit(sheet, seen)
         past = self._fits.setdefault(key, [])
         scale = max(1.0, float(np.median(past))) if len(past) > 4 else 1.0
-        if fit is not None and fit[0] < chi2.isf(FALSE_ALARM, fit[1]) * scale:
+        if fit is not None and fit[0] < chi2_isf(FALSE_ALARM, fit[1]) * scale:
             self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
             self._clear(sheet, seen)
             return seen
@@ -179,7 +179,7 @@ class Inspection:
         for k in range(len(seen)):
             rest = seen[:k] + seen[k + 1 :]
             fit = self._fit(sheet, rest) if len({s.marker for s in rest}) > 1 else None
-            if fit is not None and fit[0] < chi2.isf(FALSE_ALARM, fit[1]):
+            if fit is not None and fit[0] < chi2_isf(FALSE_ALARM, fit[1]):
                 camera, common = self._pinhole(rest[0].camera), self._rig.noise.marker_common_px
                 return apparent_side(rest, sheet.board, camera, common)[0]
         return sheet.board.side_m

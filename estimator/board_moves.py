@@ -5,10 +5,10 @@ from collections.abc import Callable, Mapping, Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..factors import keys
 from ..factors.camera import CameraModel
+from ..factors.chance import chi2_isf
 from ..factors.geometry import pose3
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Rig
@@ -65,7 +65,7 @@ def displacement(
         if best is None or distance < best[0]:
             best = distance, o_T_f, own + J[:, :6] @ spread[:6, :6] @ J[:, :6].T
     assert best is not None
-    if best[0] < chi2.isf(rig.gates.gate_probability, 6):
+    if best[0] < chi2_isf(rig.gates.gate_probability, 6):
         return None
     return Displaced(keyframe, stamp_ns, seen, best[1], best[2])
 
@@ -85,7 +85,7 @@ def new_place(displaced: list[Displaced]) -> gtsam.Pose3 | None:
     last, own = told[-1]
     for other, covariance in told[-VIEWS_TO_BELIEVE:-1]:
         delta = gtsam.Pose3.Logmap(last.between(other))
-        if delta @ np.linalg.solve(own + covariance, delta) > chi2.isf(DISAGREE, 6):
+        if delta @ np.linalg.solve(own + covariance, delta) > chi2_isf(DISAGREE, 6):
             return None
     return last
 
@@ -100,7 +100,7 @@ def still_moving(displaced: list[Displaced]) -> list[Displaced]:
         if view.o_T_f is None or view.covariance is None:
             continue
         delta = gtsam.Pose3.Logmap(last.o_T_f.between(view.o_T_f))
-        if delta @ np.linalg.solve(last.covariance + view.covariance, delta) > chi2.isf(DISAGREE, 6):
+        if delta @ np.linalg.solve(last.covariance + view.covariance, delta) > chi2_isf(DISAGREE, 6):
             gone.append(view)
     return gone
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ..factors import keys
 from ..factors.board import page_corners, page_factor, print_scale_prior, side_prior
+from ..factors.chance import chi2_isf
 from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.noise import gaussian, robust
 from ..factors.projection import machine_projection, mobile_projection
@@ -121,7 +121,7 @@ class Boards:
 
     def gate(self) -> float:
         """Chi-square that six degrees of freedom exceed by chance with the gate's probability."""
-        return float(chi2.isf(self._rig.gates.gate_probability, 6))
+        return chi2_isf(self._rig.gates.gate_probability, 6)
 
     def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
         """Would a board get its first pose from these sightings of one frame alone?"""

@@ -11,6 +11,7 @@ from ..factors import keys
 from ..factors.measurements import Rejection
 from .batch import MINIMUM_VIEWS, outliers
 from .engine import Engine
+from .linearised import linearise
 from .marginal import FAMILY
 
 
@@ -78,7 +79,7 @@ class Bounded:
         """What noise does not explain is not put into the prior, which nobody can take apart again."""
         engine = self.engine
         log = engine.solver.log
-        found = outliers(log, engine.state.values, engine.rig.gates.robust_sigma, set())
+        found = outliers(linearise(log, (), engine.solver.values(), engine.rig.gates.robust_sigma))
         mine = [(i, told) for i, told in found if poses.intersection(log.factors[i].keys())]
         log.off.update(i for i, _ in mine)
         engine.rejected += [told for _, told in mine]

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
 
-from .batch import residual_norm
-from .graph import FactorLog, Record
+from ..factors.chance import chi2_cdf, chi2_ppf, normal_isf
+from .graph import Record
 from .linear import LinearSystem, deviate
+from .linearised import Linearised
 from .result import Consistency, FamilyConsistency
 
 Float = NDArray[np.float64]
@@ -34,29 +34,21 @@ class PriorTest:
     """Whitened residual."""
 
 
-def family_tests(
-    log: FactorLog,
-    active: list[tuple[int, gtsam.NonlinearFactor, Record]],
-    system: LinearSystem,
-    values: gtsam.Values,
-    robust_sigma: float,
-) -> tuple[FamilyConsistency, ...]:
+def family_tests(at: Linearised) -> tuple[FamilyConsistency, ...]:
     """Chi-square of every family of measurements that has degrees of freedom to spare."""
-    families = sorted({r.family for _, _, r in active})
-    group = np.array([families.index(r.family) for _, _, r in active])
+    system = at.system
+    families = sorted({r.family for _, _, r in at.active})
+    group = np.array([families.index(r.family) for _, _, r in at.active])
     shares = system.leverage(group, len(families))
     tests = []
     for g, family in enumerate(families):
-        members = [(f, r) for _, f, r in active if r.family == family]
-        norms = np.array([residual_norm(f, values, robust_sigma, r.rejectable) for f, r in members])
-        rows = int(system.rows[group == g].sum())
-        dof = max(rows - float(shares[g]), 0.0)
-        soft = int(sum(n > 3.0 * np.sqrt(f.dim()) for n, (f, _) in zip(norms, members, strict=True)))
-        total = float((norms**2).sum())
+        norms, rows = at.norms[group == g], system.rows[group == g]
+        dof = max(float(rows.sum() - shares[g]), 0.0)
+        soft = int((norms > 3.0 * np.sqrt(rows)).sum())
         lower, upper = limits(dof)
-        ranks = chi2.cdf(norms**2, [f.dim() for f, _ in members])
-        tenths = tuple(int(n) for n in np.histogram(ranks, 10, (0.0, 1.0))[0])
-        tests.append(FamilyConsistency(family, total, dof, lower, upper, len(members), soft, tenths))
+        tenths = tuple(int(n) for n in np.histogram(chi2_cdf(norms**2, rows), 10, (0.0, 1.0))[0])
+        total = float((norms**2).sum())
+        tests.append(FamilyConsistency(family, total, dof, lower, upper, len(norms), soft, tenths))
     return tuple(tests)
 
 
@@ -64,8 +56,8 @@ def limits(dof: float) -> tuple[float, float]:
     """Acceptance limits of chi2 / dof: what chance and a quarter of uncertainty in sigma allow."""
     if dof < 1.0:
         return 0.0, float("inf")
-    lower = float(chi2.ppf(FALSE_ALARM / 2, dof)) / dof / (1 + SIGMA_TOLERANCE) ** 2
-    upper = float(chi2.ppf(1 - FALSE_ALARM / 2, dof)) / dof * (1 + SIGMA_TOLERANCE) ** 2
+    lower = chi2_ppf(FALSE_ALARM / 2, dof) / dof / (1 + SIGMA_TOLERANCE) ** 2
+    upper = chi2_ppf(1 - FALSE_ALARM / 2, dof) / dof * (1 + SIGMA_TOLERANCE) ** 2
     return lower, upper
 
 
@@ -91,7 +83,7 @@ def judge(families: tuple[FamilyConsistency, ...], priors: list[PriorTest], path
             reasons.append(
                 f"{f.family}: residuals are {factor:.2f} times what their sigmas say (limit {np.sqrt(f.upper):.2f})"
             )
-    limit = float(norm.isf(PRIOR_FALSE_ALARM / 2))
+    limit = normal_isf(PRIOR_FALSE_ALARM / 2)
     for test in priors:
         if test.sigma > limit:
             reasons.append(

@@ -16,19 +16,8 @@ Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 FEWEST_VIEWS = 8
 FEWEST_PAIRS = 300
 LARGEST = 4.0
-
-
-def inflated_system(active: Active, values: gtsam.Values, family: str) -> tuple[LinearSystem, float]:
-    """The linear system of factors at an estimate, its covariances those of correlated tracks; and their factor."""
-    graph = gtsam.NonlinearFactorGraph()
-    for _, factor, _ in active:
-        graph.add(factor)
-    system = LinearSystem(graph, values)
-    records = [record for _, _, record in active]
-    inflation = track_inflation(records, system, family)
-    of_tracks = np.array([r.family == family for r in records])
-    system.inflation[np.repeat(of_tracks, system.rows)] = inflation
-    return system, inflation
+TAKEN = 0.75
+"""Parameters of a landmark per row of one of its views (two cameras, two rows each)."""
 
 
 def track_inflation(records: list[Record], system: LinearSystem, family: str) -> float:
@@ -36,8 +25,9 @@ def track_inflation(records: list[Record], system: LinearSystem, family: str) ->
 
     For a first-order autoregressive error with lag-one correlation rho a mean over many views has
     (1 + rho) / (1 - rho) times the variance of the same number of independent ones (Bartlett 1946). rho comes from
-    the whitened residuals of long tracks. A landmark's three parameters, fitted to n views by two cameras, make
-    residuals of white noise anticorrelated by 1.5 / n, which is added back.
+    the whitened residuals of long tracks. A landmark's three parameters, fitted to n views by two cameras, take
+    3 / (4 n) of every residual's variance, which leaves white noise anticorrelated by 0.75 / (n - 0.75) between any
+    two views; that is added back.
 
     Returns:
         At least 1; exactly 1 where too few tracks are long enough to tell.
@@ -56,7 +46,7 @@ def track_inflation(records: list[Record], system: LinearSystem, family: str) ->
         count = len(residual) - 1
         products += float((residual[1:] * residual[:-1]).sum())
         squares += float((residual**2).sum()) * count / len(residual)
-        bias += 1.5 / len(residual) * count
+        bias += TAKEN / (len(residual) - TAKEN) * count
         pairs += count
     if pairs < FEWEST_PAIRS or squares <= 0.0:
         return 1.0

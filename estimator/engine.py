@@ -15,6 +15,7 @@ from ..factors.board import distance_factor
 from ..factors.calibration import (
     cal3,
     depth_prior,
+    depth_ray_prior,
     intrinsics_prior,
     left_T_right,
     rgb_mean,
@@ -24,13 +25,22 @@ from ..factors.calibration import (
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.links import gauge_prior, mount_factor, mount_pose
-from ..factors.measurements import Event, MarkerSighting, OutlineSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import (
+    CylinderSighting,
+    Event,
+    MarkerSighting,
+    OutlineSighting,
+    Pick,
+    Rejection,
+    StereoFrame,
+)
 from ..factors.noise import sigmas
 from ..factors.rig import Distance, Rig
 from ..frontends.pick_image import CutOut
 from ..frontends.resection import camera_pose
 from .boards import DISTANCES, Boards
 from .bundle import Bundle
+from .depth_pipes import DepthPipes
 from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
@@ -48,6 +58,8 @@ corners of all of them."""
 
 COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
+NOMINAL_DEPTH_FOCAL_PX = 580.0
+"""Of a Kinect v1, where clouds come without camera_info: turns the rig file's pixels into angles."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
 
@@ -59,8 +71,12 @@ WAITING_PICKS = 100
 class Engine:
     """Graph, iSAM2 and the sensors' book-keeping of one run."""
 
-    def __init__(self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator) -> None:
+    def __init__(
+        self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator, advises: bool = True
+    ) -> None:
         self.rig = rig
+        self.advises = advises
+        """The result tells what to measure next; campaigns do without."""
         self.cameras = dict(cameras)
         self.state = State()
         self.solver = Incremental()
@@ -68,6 +84,7 @@ class Engine:
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
+        self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.events: list[Event] = []
         self.rejected: list[Rejection] = []
@@ -92,6 +109,11 @@ class Engine:
         self.astray = False
         """The map is from an earlier run, and the camera has not found itself in it."""
         self.end_ns = 0
+
+    @property
+    def base(self) -> int:
+        """Key of `o_T_b` of the present station."""
+        return keys.base(0)
 
     # The loop -------------------------------------------------------------------------------------------------
 
@@ -148,6 +170,11 @@ class Engine:
             update = Update()
             update.guess(keys.DEPTH, np.zeros(2))
             update.add(depth_prior(self.rig.kinect), _prior("Kinect depth", bundle.stamp_ns))
+            camera = self.cameras.get("b_depth")
+            focal_px = NOMINAL_DEPTH_FOCAL_PX if camera is None else camera.fx
+            update.guess(keys.DEPTH_RAYS, np.zeros(3))
+            prior = depth_ray_prior(self.rig.cameras.b_depth, focal_px)
+            update.add(prior, _prior("rays of the depth camera", bundle.stamp_ns))
             self._take(update)
 
     def _open_camera(self, camera: str, stamp_ns: int) -> None:
@@ -419,6 +446,10 @@ class Engine:
         if where is not None:
             self._take(self.pipes.outline(outline, where))
 
+    def add_cylinder(self, pipe: str, base: int, found: CylinderSighting | Rejection) -> None:
+        """A pipe in the Kinect's cloud of a station, or why it was not found; enters with the next update."""
+        self._take(self.depth_pipes.add(found, pipe, base, self.solver))
+
     def lost_picks(self) -> list[Pick]:
         """Picks in cameras that have no place at their stamp."""
         return [*(p for p, _ in self.open_picks), *(p for b in self._waiting for p in b.picks)]
@@ -453,6 +484,7 @@ class Engine:
             *self.boards.held_back(),
             *self.pipes.rejected,
             *self.pipes.held_back(),
+            *self.depth_pipes.refused.values(),
             *self.surfaces.refused.values(),
             *waiting,
         ]

@@ -29,6 +29,7 @@ _THRESHOLDS = {
     "r": [1e-4],
     "k": [0.01, 0.01, 1.0, 0.01, 0.01, 1e-4, 1e-4, 1e-4, 1e-4],
     "d": [2e-4, 2e-4],
+    "g": [1e-5, 1e-5, 1e-4],
 }
 
 RELINEARIZE_EVERY = 10
@@ -92,6 +93,10 @@ class Incremental:
             self._isam = gtsam.ISAM2(_parameters())
             self._isam.update(graph, values)
         self._values = self._isam.calculateEstimate()
+
+    def values(self) -> gtsam.Values:
+        """The estimate over the factors of the log."""
+        return self._values
 
     def switch_off(self, remove: Iterable[int]) -> gtsam.Values:
         """Takes factors out again, by their places in the log."""

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
-from scipy.stats import chi2, norm
 
+from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
 
 Float = NDArray[np.float64]
@@ -23,8 +24,8 @@ CHUNK = 384
 
 def deviate(total: float, dof: int) -> float:
     """Chi-square in words of sigmas of one normal variable, two-sided."""
-    tail = float(chi2.sf(total, dof))
-    return float(np.sqrt(total)) if tail < 1e-300 else float(norm.isf(tail / 2))
+    tail = chi2_sf(total, dof)
+    return float(np.sqrt(total)) if tail < 1e-300 else normal_isf(tail / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +60,7 @@ class LinearSystem:
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         linear = graph.linearize(values)
-        self.rows = np.array([linear.at(i).jacobian()[0].shape[0] for i in range(linear.size())])
+        self.rows = np.array([graph.at(i).dim() for i in range(graph.size())])
         self.starts = np.concatenate([[0], np.cumsum(self.rows)])
         entries = np.asarray(linear.sparseJacobian_())
         keys = list(linear.keyVector())
@@ -79,7 +80,11 @@ class LinearSystem:
         self._columns = column
         self.inflation = np.ones(shape[0])
         """Variance of each row's error over what its whitening says, for errors that are correlated among rows."""
-        self._normal = NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
+
+    @cached_property
+    def _normal(self) -> NormalEquations:
+        """Only covariances need it, residuals do not."""
+        return NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
 
     @property
     def parameters(self) -> int:

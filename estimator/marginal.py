@@ -99,7 +99,22 @@ def gaussian_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stay: C
     return GaussianPrior(order, widths, information[:-1, :-1], information[:-1, -1], only(values, order))
 
 
-WIDTHS = {"x": 6, "f": 6, "b": 6, "e": 6, "l": 3, "q": 3, "p": 3, "u": 3, "v": 3, "h": 2, "r": 1, "k": 9, "d": 2}
+WIDTHS = {
+    "x": 6,
+    "f": 6,
+    "b": 6,
+    "e": 6,
+    "l": 3,
+    "q": 3,
+    "p": 3,
+    "u": 3,
+    "v": 3,
+    "h": 2,
+    "r": 1,
+    "k": 9,
+    "d": 2,
+    "g": 3,
+}
 """Degrees of freedom by kind of variable."""
 
 

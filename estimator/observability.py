@@ -22,6 +22,7 @@ _MISSING = {
     "k": "give the camera's calibration smaller sigmas in the rig file, or freeze it",
     "e": "give the extrinsics smaller sigmas in the rig file, or freeze them",
     "d": "freeze the depth offset and scale in the rig file",
+    "g": "freeze focal and centre of the depth camera in the rig file",
 }
 _VARIABLE = re.compile(r"near\s+variable\s+(\d+)")
 

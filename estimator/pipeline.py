@@ -6,6 +6,7 @@ from ..factors.errors import LogError, ObservabilityError
 from ..factors.rig import Rig
 from ..frontends.fiducials.messages import UNKNOWN_IDS
 from .bundle import Bundle
+from .depth_search import DepthSearch
 from .engine import Engine
 from .outline_search import OutlineSearch
 from .sensing import Sensed, SensingReport
@@ -19,6 +20,7 @@ class Pipeline:
         self.rig = rig
         self.engine = Engine(rig, {}, associate)
         self._outlines = OutlineSearch(self.engine)
+        self._depths = DepthSearch(self.engine)
 
     def run(self, seen: Iterable[Sensed]) -> Iterator[int]:
         """Takes what the front ends see in the order of time; yields each stamp (ns) when it has been worked in."""
@@ -34,8 +36,9 @@ class Pipeline:
         engine.pick_images.update(sensed.clicked)
         if sensed.pair is not None and sensed.stamp_ns in engine.keyframe_at:
             self._outlines.see(sensed.pair, sensed.bundle.picks)
-        if sensed.cloud is not None:
-            engine.add(Bundle(sensed.stamp_ns, cloud=sensed.cloud))
+        if sensed.depth is not None:
+            engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud))
+            self._depths.see(sensed.depth)
 
     def look_back(self, sensed: Sensed) -> bool:
         """Clicks in a frame that was taken in before: it becomes a keyframe. False where that is too late."""
@@ -46,6 +49,11 @@ class Pipeline:
         self._outlines.see(sensed.pair, sensed.bundle.picks)
         return True
 
+    def complete(self) -> None:
+        """What waited for something else gets its last chance."""
+        self.engine.revisit()
+        self._depths.search()
+
     def check(self, report: SensingReport) -> None:
         """After the last message: is there anything to estimate from, and was everything understood?
 
@@ -53,7 +61,7 @@ class Pipeline:
             LogError: a pick without depth or second view, or on a camera that never delivered.
             ObservabilityError: a pick in a camera that nothing places.
         """
-        self.engine.revisit()
+        self.complete()
         self._check_ids(report)
         pairing = report.pairing
         if pairing.pairs == 0 and pairing.unpaired and not self.engine.odometry.keyframe_stamps:

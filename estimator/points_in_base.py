@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import chi2
 
 from ..factors import keys
+from ..factors.chance import chi2_ppf
 from ..factors.geometry import point_to_frame
 from .result import PipeEstimate
 
@@ -42,7 +42,7 @@ def radius95(covariance: Float) -> float:
     if variances[0] == 0.0:
         return 0.0
     sigma = np.sqrt(variances)
-    upper = float(sigma[0] * np.sqrt(chi2.ppf(0.95, 3)))
+    upper = float(sigma[0] * np.sqrt(chi2_ppf(0.95, 3)))
     lower = float(sigma[0] * 1.9)
     root = brentq(lambda r: _inside(r, sigma) - 0.95, lower, upper * 1.0001, xtol=1e-9 + 1e-6 * upper)
     return float(root)  # pyright: ignore[reportArgumentType]  # without full_output it is a number

@@ -4,15 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from ..factors.chance import chi2_ppf
 from .region_probability import axis_frame
 from .result import PipeEstimate, PointEstimate, Result
 from .surroundings import map_rows
 
 Float = NDArray[np.float64]
 
-K3 = float(np.sqrt(chi2.ppf(0.95, 3)))
+K3 = float(np.sqrt(chi2_ppf(0.95, 3)))
 LANDMARK, KINECT, PIPE, WAY = (90, 140, 220), (150, 150, 150), (240, 150, 30), (60, 190, 190)
 ROLES = {"cut": (220, 30, 30), "grasp": (30, 160, 60)}
 OTHER = (150, 60, 200)

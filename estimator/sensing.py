@@ -1,7 +1,7 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeGuard
 
 import cv2
@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
-from ..factors.measurements import CloudFrame, MarkerSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .bundle import Bundle
+from .depth_sensor import DepthView
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
 
@@ -32,8 +33,8 @@ class Sensed:
     """What the front ends make of all messages of one stamp. Plain data: it may cross a process border."""
 
     bundle: Bundle
-    cloud: CloudFrame | None = None
-    """Surfaces, when enough depth images have gathered."""
+    depth: DepthView | None = None
+    """What the Kinect saw, when enough depth images have gathered."""
     pair: PairImages | None = None
     """The pictures, where the pair is a keyframe or was clicked in."""
     clicked: Mapping[tuple[str, int, str], CutOut] = field(default_factory=dict)
@@ -119,7 +120,7 @@ class Sensing:
         self._known |= fresh.keys()
         return Sensed(
             Bundle(stamp_ns, frame, tuple(sightings), picks, depths),
-            self._cloud(stamp_ns, group),
+            self._depth(stamp_ns, group),
             kept,
             self._clicked(picks, pair, group),
             fresh,
@@ -188,15 +189,18 @@ class Sensing:
             self._last_colour_ns = stamp_ns
         return due
 
-    def _cloud(self, stamp_ns: int, group: list[Item]) -> CloudFrame | None:
-        cloud = None
+    def _depth(self, stamp_ns: int, group: list[Item]) -> DepthView | None:
+        view, kinect = None, self.sensors.kinect
         for item in group:
-            if isinstance(item, Message) and isinstance(item.body, DepthBody):
-                if item.topic == self.rig.cameras.b_depth.image_topic:
-                    cloud = self.sensors.depth(stamp_ns, item.body.depth_m()) or cloud
-            elif isinstance(item, Message) and isinstance(item.body, CloudBody):
+            if not isinstance(item, Message):
                 continue
-        return cloud
+            if isinstance(item.body, DepthBody) and item.topic == self.rig.cameras.b_depth.image_topic:
+                view = self.sensors.depth(stamp_ns, item.body.depth_m()) or view
+            if isinstance(item.body, CloudBody) and item.topic == self.rig.kinect.points_topic:
+                view = kinect.cloud(stamp_ns, item.body.points_m()) if kinect.cloud_due(stamp_ns) else view
+        if view is None or self._colour is None:
+            return view
+        return replace(view, colour=grey(self._colour.pixels()))
 
     def _clicked(
         self, picks: tuple[Pick, ...], pair: PairImages | None, group: list[Item]
@@ -219,11 +223,12 @@ class Sensing:
 
 def images(pair: StereoPair) -> PairImages:
     """The pictures of a stereo pair."""
-    left, right = (_grey(m.body.pixels()) for m in (pair.left, pair.right) if isinstance(m.body, ImageBody))
+    left, right = (grey(m.body.pixels()) for m in (pair.left, pair.right) if isinstance(m.body, ImageBody))
     return PairImages(pair.stamp_ns, left, right)
 
 
-def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """One channel, shape (height, width)."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 

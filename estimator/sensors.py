@@ -10,23 +10,20 @@ from numpy.typing import NDArray
 from ..factors.calibration import left_T_right
 from ..factors.camera import CameraModel
 from ..factors.errors import LogError
-from ..factors.measurements import CameraName, CloudFrame, MarkerSighting, Pick, Rejection, StereoFrame
+from ..factors.measurements import CameraName, MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
-from ..frontends.cloud.frontend import CloudFrontEnd, average_depth
 from ..frontends.fiducials.detector import MarkerFrontEnd
 from ..frontends.fiducials.messages import sightings_from_messages
 from ..frontends.paper_chain import clicked_point
 from ..frontends.stereo.frontend import StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
+from .depth_sensor import DepthSensor, DepthView
 from .sides import swapped
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 
-DEPTH_FRAMES = 10
-DEPTH_WINDOW_NS = 2_000_000_000
-"""Depth images of a still machine that are averaged before surfaces are read from them: so many, or so long."""
 MATCH_SIGMA_PX = 0.5
 """Disparity error of semi-global matching on a window's median (OpenCV, one pixel steps interpolated to 1/16)."""
 
@@ -60,8 +57,7 @@ class Sensors:
         self.cameras: dict[str, CameraModel] = {}
         self._stereo: StereoFrontEnd | None = None
         self._markers: dict[str, MarkerFrontEnd] = {}
-        self._clouds: CloudFrontEnd | None = None
-        self._depths: list[tuple[int, NDArray[np.float32]]] = []
+        self.kinect = DepthSensor(rig.kinect)
         self._unmatched = 0
         """Pairs from the start on that had hardly a feature in common."""
         self.rejected: list[Rejection] = []
@@ -176,19 +172,11 @@ class Sensors:
 
     # Kinect ---------------------------------------------------------------------------------------------------
 
-    def depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> CloudFrame | None:
-        """Surface samples of the last depth images, once enough have gathered."""
-        if self._clouds is None:
-            camera = self._camera("b_depth")
-            self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)
-            self._clouds = CloudFrontEnd(camera, self.rig.kinect.model)
-        self._depths.append((stamp_ns, depth_m))
-        if len(self._depths) < DEPTH_FRAMES and stamp_ns - self._depths[0][0] < DEPTH_WINDOW_NS:
-            return None
-        mean = average_depth(np.stack([depth for _, depth in self._depths]))
-        count = len(self._depths)
-        self._depths.clear()
-        return self._clouds.process(stamp_ns, mean, count)
+    def depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> DepthView | None:
+        """The last depth images, once enough have gathered."""
+        camera = self._camera("b_depth")
+        self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)
+        return self.kinect.image(stamp_ns, depth_m, camera)
 
     # Picks ----------------------------------------------------------------------------------------------------
 

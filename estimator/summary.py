@@ -8,23 +8,31 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.board import mean_point
-from ..factors.calibration import depth_sigmas, intrinsics_covariance, left_T_right, rgb_mean, rgb_sigmas, stereo_sigmas
+from ..factors.calibration import (
+    depth_ray_sigmas,
+    depth_sigmas,
+    intrinsics_covariance,
+    left_T_right,
+    rgb_mean,
+    rgb_sigmas,
+    stereo_sigmas,
+)
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
 from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
+from .agreement import cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
-from .correlation import Active, inflated_system
-from .engine import Engine, distance_name
+from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
-from .odometry import FAMILY as ODOMETRY
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
+    Advice,
     CalibrationEstimate,
     Consistency,
     DistanceEstimate,
@@ -47,9 +55,7 @@ class Summary:
         self._engine = engine
         self._values = solution.values
         self._solution = solution
-        off = set(solution.outliers)
-        self._active: Active = [row for row in engine.solver.log.active() if row[0] not in off]
-        self._system, self._inflation = inflated_system(self._active, solution.values, ODOMETRY)
+        self._active, self._system = solution.at.active, solution.at.system
 
     def result(
         self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
@@ -78,11 +84,17 @@ class Summary:
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=advise(engine, self._values, self._system, self._active, points, self._inflation),
+            advice=self._advice(points),
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
         )
+
+    def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
+        engine = self._engine
+        if not engine.advises:
+            return {}
+        return advise(engine, self._values, self._system, self._active, points, self._solution.at.inflation)
 
     def _tell_corner_rms(self) -> None:
         """Distance of the accepted corners from where the solution puts them."""
@@ -226,6 +238,17 @@ class Summary:
             rows.append(
                 CalibrationEstimate("depth_scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
             )
+            value, sigma = self._values.atVector(keys.DEPTH_RAYS), self._sigmas(keys.DEPTH_RAYS)
+            camera, model = rig.cameras.b_depth, engine.cameras.get("b_depth")
+            prior = depth_ray_sigmas(camera, NOMINAL_DEPTH_FOCAL_PX if model is None else model.fx)
+            names = (("x", "centre"), ("y", "centre"), ("scale", "focal"))
+            for i, (part, settled) in enumerate(names):
+                rows.append(
+                    CalibrationEstimate(
+                        f"depth_ray_{part}", "1" if i == 2 else "rad", value[i], sigma[i], 0.0, prior[i],
+                        settled in camera.freeze,
+                    )
+                )  # fmt: skip
         for board in rig.boards:
             page = keys.page(engine.boards.index(board.id))
             if self._values.exists(page):
@@ -323,13 +346,13 @@ class Summary:
     # Consistency ----------------------------------------------------------------------------------------------
 
     def _consistency(self) -> Consistency:
-        engine = self._engine
-        families = family_tests(
-            engine.solver.log, self._active, self._system, self._values, engine.rig.gates.robust_sigma
-        )
+        families = family_tests(self._solution.at)
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
+        cylinders = cylinder_tests(self._engine.depth_pipes, self._active, self._system, self._values)
+        priors += cylinders
+        paths |= {t.record.what: t.sigma for t in cylinders}
         return judge(families, priors, paths)
 
     def _streaming_difference(self) -> dict[str, float]:

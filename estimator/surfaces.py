@@ -87,7 +87,7 @@ class Surfaces:
         points = np.array([o_T_b.transformTo(self._state.point(keys.landmark(t))) for t in rows])
         sigma = self._spread(rows, camera, observations)
         offset, scale = self._state.vector(keys.DEPTH)
-        measured = corrected(points, -offset, -scale)
+        measured = corrected(points, -offset, -scale, -self._state.vector(keys.DEPTH_RAYS))
         matches, refusals = self._associate(measured, sigma, self.cloud)
         seen_from = o_T_b.transformTo(camera.translation())
         matches, behind = _same_side(matches, seen_from)

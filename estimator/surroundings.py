@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from ..factors import keys
-from ..factors.cloud import corrected
+from ..factors.cloud import corrected, depth_moves, depth_states
 from .engine import Engine
 from .linear import LinearSystem
 from .points_in_base import point_blocks
@@ -59,7 +59,7 @@ def surroundings(engine: Engine, values: gtsam.Values, system: LinearSystem) -> 
     measured, cloud = np.zeros((0, 3)), engine.surfaces.cloud
     if cloud is not None and values.exists(keys.DEPTH):
         measured = cloud.points_m
-        b_p = np.vstack([b_p, corrected(measured, *values.atVector(keys.DEPTH))])
+        b_p = np.vstack([b_p, corrected(measured, *depth_states(values))])
         sigma = np.concatenate([sigma, cloud.sigma_m])
     return Surroundings(b_p, sigma, tuple(names), measured)
 
@@ -174,6 +174,7 @@ def _distance_sigma(
         return float(np.sqrt(system.covariance(blocks)[0, 0]))
     measured = found.measured_m[row - len(found.landmarks)]
     _, of_point = point_blocks(values, keys.base(0), key)
-    depth = np.array([[unit @ measured / measured[2], unit @ measured]])
-    blocks = [(k, -unit[None] @ J) for k, J in of_point] + [(keys.DEPTH, depth)]
+    depth = unit[None] @ depth_moves(measured[None])[0]
+    blocks = [(k, -unit[None] @ J) for k, J in of_point]
+    blocks += [(keys.DEPTH, depth[:, :2]), (keys.DEPTH_RAYS, depth[:, 2:])]
     return float(np.sqrt(system.covariance(blocks)[0, 0] + found.sigma_m[row] ** 2))

@@ -17,6 +17,8 @@ class ViewCells:
         """The view that was counted last."""
         self.views = 0
         """Number of views from its place so far, it included."""
+        self.cell = -1
+        """The place that it is from, numbered in the order of their first views."""
         self._poses = np.empty((16, 12))
         self._counts: list[int] = []
 
@@ -36,4 +38,4 @@ class ViewCells:
                 self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._poses[cell] = pose
             self._counts.append(1)
-        self.last, self.views = view, self._counts[cell]
+        self.last, self.cell, self.views = view, cell, self._counts[cell]

@@ -108,3 +108,14 @@ def depth_sigmas(kinect: Kinect) -> Float:
 
 def depth_prior(kinect: Kinect) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorVector(keys.DEPTH, np.zeros(2), sigmas(depth_sigmas(kinect)))
+
+
+def depth_ray_sigmas(camera: Camera, focal_px: float) -> Float:
+    """Sigmas of a depth camera's rays (shift x, shift y [rad], scale), shape (3,)."""
+    centre = FROZEN_RAD if "centre" in camera.freeze else max(camera.centre_sigma_px / focal_px, FROZEN_RAD)
+    scale = FROZEN_RAD if "focal" in camera.freeze else max(camera.focal_sigma_rel, FROZEN_RAD)
+    return np.array([centre, centre, scale])
+
+
+def depth_ray_prior(camera: Camera, focal_px: float) -> gtsam.NonlinearFactor:
+    return gtsam.PriorFactorVector(keys.DEPTH_RAYS, np.zeros(3), sigmas(depth_ray_sigmas(camera, focal_px)))

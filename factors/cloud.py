@@ -11,29 +11,53 @@ from .noise import Model
 Float = NDArray[np.float64]
 
 
-def corrected(points_m: Float, offset_m: float, scale: float) -> Float:
-    """Kinect points with depth offset and scale applied along their rays, shape (..., 3).
+def corrected(points_m: Float, offset_m: float, scale: float, rays: Float | None = None) -> Float:
+    """Kinect points with the depth camera's calibration states applied, shape (..., 3).
 
-    true depth = measured * (1 + scale) + offset; the ray of a pixel does not change.
+    true depth = measured * (1 + scale) + offset, and the pixel's ray moves by `rays`, see `keys.DEPTH_RAYS`.
     """
-    return points_m * (1.0 + scale + offset_m / points_m[..., 2:3])
+    moved = points_m * (1.0 + scale + offset_m / points_m[..., 2:3])
+    if rays is not None:
+        moved[..., :2] = moved[..., :2] * (1.0 + rays[2]) + moved[..., 2:] * rays[:2]
+    return moved
+
+
+def depth_states(values: gtsam.Values) -> tuple[float, float, Float]:
+    """Offset [m], scale and rays of the depth camera, as `corrected` takes them."""
+    offset, scale = values.atVector(keys.DEPTH)
+    return float(offset), float(scale), values.atVector(keys.DEPTH_RAYS)
+
+
+def depth_moves(points_m: Float, offset_m: float = 0.0, scale: float = 0.0, rays: Float | None = None) -> Float:
+    """How `corrected` follows its states: d p / d (offset, scale, shift x, shift y, ray scale).
+
+    Args:
+        points_m: shape (n, 3), as measured.
+
+    Returns:
+        shape (n, 3, 5).
+    """
+    by_depth = [corrected(p, 0.0, 0.0, rays) for p in (points_m / points_m[:, 2:], points_m)]
+    x, y, z = np.moveaxis(corrected(points_m, offset_m, scale), -1, 0)
+    none = np.zeros_like(z)
+    by_rays = [np.stack(c, -1) for c in ((z, none, none), (none, z, none), (x, y, none))]
+    return np.asarray(np.stack([*by_depth, *by_rays], axis=2), np.float64)
 
 
 def plane_factor(base: int, landmark: int, plane_point_m: Float, normal: Float, noise: Model) -> gtsam.CustomFactor:
     """`normal . (b_p - c)` = 0 for a landmark p of {o} on the surface through c in {b}.
 
-    Residual (1,), metres. Variables: `o_T_b`, the landmark, the depth offset and scale, which move c along its ray.
+    Residual (1,), metres. Variables: `o_T_b`, the landmark, and the depth camera's calibration, which moves c.
     """
-    along = float(normal @ plane_point_m)
-    depth_jacobian = np.array([[-along / plane_point_m[2], -along]])
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         b_p, d_pose, d_point = point_to_frame(values.atPose3(base), values.atPoint3(landmark))
-        offset, scale = values.atVector(keys.DEPTH)
+        states = depth_states(values)
         if jacobians is not None:
             jacobians[0] = normal[None, :] @ d_pose
             jacobians[1] = normal[None, :] @ d_point
-            jacobians[2] = depth_jacobian
-        return np.array([normal @ (b_p - corrected(plane_point_m, offset, scale))])
+            moves = -normal @ depth_moves(plane_point_m[None], *states)[0]
+            jacobians[2], jacobians[3] = moves[None, :2], moves[None, 2:]
+        return np.array([normal @ (b_p - corrected(plane_point_m, *states))])
 
-    return gtsam.CustomFactor(noise, [base, landmark, keys.DEPTH], error)
+    return gtsam.CustomFactor(noise, [base, landmark, keys.DEPTH, keys.DEPTH_RAYS], error)

@@ -15,6 +15,7 @@ _WORDS = {
     "r": "radius of pipe {}",
     "k": "intrinsics of camera {}",
     "e": "camera extrinsics {}",
+    "g": "centre and focal length of the Kinect's depth camera",
     "d": "depth offset and scale of the Kinect",
 }
 
@@ -87,6 +88,8 @@ def extrinsics(camera: str) -> int:
 
 DEPTH: int = gtsam.symbol("d", 0)
 """Kinect depth: true = measured * (1 + scale) + offset; Vector2 (offset [m], scale)."""
+DEPTH_RAYS: int = gtsam.symbol("g", 0)
+"""Rays of the depth camera, z = 1: true = given * (1 + scale) + shift; Vector3 (shift x, shift y [rad], scale)."""
 
 
 def kind(key: int) -> str:

@@ -116,6 +116,8 @@ class CylinderSighting:
     inliers: int
     rms_m: float
     source: Literal["silhouette", "stereo_cloud", "kinect_cloud"]
+    by_depth: Float | None = None
+    """Shape (7, 5), d (point_a, point_b, radius) / d (depth states, `cloud.depth_moves`); None: no depth camera's."""
 
 
 @dataclass(frozen=True, slots=True)

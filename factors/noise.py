@@ -5,7 +5,8 @@ from functools import cache
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
+
+from .chance import chi2_ppf, normal_cdf
 
 Float = NDArray[np.float64]
 Model = gtsam.noiseModel.Base
@@ -34,14 +35,9 @@ def huber(model: Model, scale: float) -> Model:
 @cache
 def robust_scale(robust_sigma: float, dimension: int) -> float:
     """Norm of a whitened residual beyond which it is softened: as rare as `robust_sigma` is for one dimension."""
-    return float(np.sqrt(chi2.ppf(2.0 * norm.cdf(robust_sigma) - 1.0, dimension)))
+    return float(np.sqrt(chi2_ppf(2.0 * normal_cdf(robust_sigma) - 1.0, dimension)))
 
 
 def robust(model: Model, robust_sigma: float) -> Model:
     """Huber around a model, with the scale that suits its dimension."""
     return huber(model, robust_scale(robust_sigma, model.dim()))
-
-
-def huber_norm(loss: float, scale: float) -> float:
-    """Whitened residual norm from a Huber factor's `error`, the inverse of the loss."""
-    return float(np.sqrt(2.0 * loss)) if loss <= 0.5 * scale * scale else loss / scale + 0.5 * scale

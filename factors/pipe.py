@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from . import keys
 from .geometry import point_to_frame
+from .measurements import CylinderSighting
 from .noise import Model, gaussian, sigmas
 
 Float = NDArray[np.float64]
@@ -155,19 +156,48 @@ def radius_prior(pipe: int, radius_m: float, sigma_m: float) -> gtsam.NonlinearF
     return gtsam.PriorFactorVector(keys.radius(pipe), np.array([radius_m]), sigmas([sigma_m]))
 
 
-def cylinder_factor(
-    point_a_m: Float, point_b_m: Float, radius_m: float, covariance: Float, pose: int, pipe: int
-) -> gtsam.CustomFactor:
-    """A cylinder fitted to a cloud, as one summarised factor.
+def across_axis(direction: Float) -> Float:
+    """Two unit directions across a third one, shape (2, 3)."""
+    e1 = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    e1 /= np.linalg.norm(e1)
+    return np.asarray(np.stack([e1, np.cross(direction, e1)]), np.float64)
+
+
+def cylinder_covariance(sighting: CylinderSighting) -> Float:
+    """Covariance (5, 5) of a fitted cylinder as `cylinder_factor` sees it: across the axis."""
+    E = _across_ends(sighting)
+    information = E.T @ sighting.information @ E
+    return np.asarray(np.linalg.inv(0.5 * (information + information.T)), np.float64)
+
+
+def _across_ends(sighting: CylinderSighting) -> Float:
+    """The five ways to change a cylinder: each end in two directions across, and the radius; shape (7, 5)."""
+    way = sighting.point_b_m - sighting.point_a_m
+    E = np.zeros((7, 5))
+    E[:3, :2] = E[3:6, 2:4] = across_axis(way / np.linalg.norm(way)).T
+    E[6, 4] = 1.0
+    return E
+
+
+def cylinder_factor(sighting: CylinderSighting, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
+    """A cylinder fitted to a depth camera's cloud, as one summarised factor.
 
     The estimated axis passes the fitted one at the two fitted points: residual (5,) = offsets of the axis from
-    point_a and from point_b in two directions across it, and the radius. `covariance` (5, 5) is of the same.
+    point_a and from point_b in two directions across it, and the radius. Variables: the pose, the pipe, and with
+    `by_depth` the depth camera's calibration, which the fit follows.
+
+    Args:
+        noise: of the residual, see `cylinder_covariance`.
+        pose: key of the camera's pose in {o}.
     """
-    d_fit = (point_b_m - point_a_m) / np.linalg.norm(point_b_m - point_a_m)
-    e1 = np.cross(d_fit, np.eye(3)[int(np.argmin(np.abs(d_fit)))])
-    e1 /= np.linalg.norm(e1)
-    E = np.stack([e1, np.cross(d_fit, e1)])
+    ends = (sighting.point_a_m, sighting.point_b_m)
+    d_fit = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    E = across_axis(d_fit)
+    response = np.zeros((7, 5)) if sighting.by_depth is None else sighting.by_depth
+    by_depth = -_across_ends(sighting).T @ response
     variables = [pose, keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
+    if sighting.by_depth is not None:
+        variables += [keys.DEPTH, keys.DEPTH_RAYS]
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
@@ -175,20 +205,24 @@ def cylinder_factor(
         b, Jb, Rb = point_to_frame(o_T_c, values.atPoint3(variables[2]))
         residual = np.empty(5)
         d_a, d_b = np.zeros((5, 3)), np.zeros((5, 3))
-        for i, q in enumerate((point_a_m, point_b_m)):
+        for i, q in enumerate(ends):
             offset, by_a, by_b = _axis_at(a, b, q, d_fit)
             rows = slice(2 * i, 2 * i + 2)
             residual[rows] = E @ offset
             d_a[rows], d_b[rows] = E @ by_a, E @ by_b
-        residual[4] = values.atVector(variables[3])[0] - radius_m
+        residual[4] = values.atVector(variables[3])[0] - sighting.radius_m
+        if len(variables) == 6:
+            residual += by_depth @ np.concatenate([values.atVector(keys.DEPTH), values.atVector(keys.DEPTH_RAYS)])
         if jacobians is not None:
             jacobians[0] = d_a @ Ja + d_b @ Jb
             jacobians[1] = d_a @ Ra
             jacobians[2] = d_b @ Rb
             jacobians[3] = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
+            if len(variables) == 6:
+                jacobians[4], jacobians[5] = by_depth[:, :2], by_depth[:, 2:]
         return residual
 
-    return gtsam.CustomFactor(gaussian(covariance), variables, error)
+    return gtsam.CustomFactor(noise, variables, error)
 
 
 def _axis_at(a: Float, b: Float, q: Float, normal: Float) -> tuple[Float, Float, Float]:

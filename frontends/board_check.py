@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
 
 from ..factors.camera import CameraModel
+from ..factors.chance import chi2_isf
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Board, Noise
 from .board_fit import BoardFit, board_corners, fit_board
@@ -134,7 +134,7 @@ def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
         turn,
         float(np.sqrt(covariance[2, 2])),
         float(fit.extra @ np.linalg.solve(covariance, fit.extra)),
-        float(chi2_distribution.isf(_FALSE_ALARM, _SHIFT_DOF)),
+        chi2_isf(_FALSE_ALARM, _SHIFT_DOF),
     )
 
 
@@ -146,7 +146,7 @@ def _exchanged(
     before = _fit(sightings, board, camera, side_m, common_px)[0]
     if before is None or len(ids) < 2 or len(set(ids)) < len(ids):
         return []
-    if before.chi2 < chi2_distribution.isf(_FALSE_ALARM, before.dof):
+    if before.chi2 < chi2_isf(_FALSE_ALARM, before.dof):
         return []
     best: tuple[float, int, int] | None = None
     for a, b in combinations(range(len(ids)), 2):
@@ -161,7 +161,7 @@ def _exchanged(
     places = {m.id: np.array(m.centre_m) for m in board.markers}
     pair = ids[best[1]], ids[best[2]]
     gain = before.chi2 - best[0]
-    limit = float(chi2_distribution.isf(_FALSE_ALARM, before.dof))
+    limit = chi2_isf(_FALSE_ALARM, before.dof)
     sigma = float(np.sqrt(2.0) * board.centre_sigma_m)
     result = []
     for marker, other_id in (pair, pair[::-1]):

@@ -13,8 +13,8 @@ from ..estimator.executor import Executor, Outcome
 from ..factors.errors import SurecutError
 from .campaign_row import Row, failed_row
 from .campaign_run import Level, RunOrder, run
-from .measurement_level_scenario import load_scenario
-from .scenario import load_scenarios
+from .measurement_level_scenario import load_scenarios
+from .scenario import load_scenarios as load_pixel_scenarios
 
 SCENARIOS = Path(__file__).parent / "campaign_scenarios"
 RUNS = "runs"
@@ -29,27 +29,30 @@ class Campaign:
     scenarios: tuple[Mapping[str, Any], ...]
     """Run i takes scenario i modulo their number."""
     leave_out: bool = False
+    decisions: bool = False
 
     def order(self, number: int) -> RunOrder:
         """The order of one run."""
-        return RunOrder(number, self.level, self.scenarios[number % len(self.scenarios)], self.leave_out)
+        return RunOrder(
+            number, self.level, self.scenarios[number % len(self.scenarios)], self.leave_out, self.decisions
+        )
 
 
-def open_campaign(source: str, level: Level, leave_out: bool = False) -> Campaign:
+def open_campaign(source: str, level: Level, leave_out: bool = False, decisions: bool = False) -> Campaign:
     """A campaign from a scenario file or the name of one that comes with surecut.
 
     Raises:
         SurecutError: there is no such scenario, or something in it is wrong.
     """
     if level == "pixels":
-        found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(source))
+        found = tuple(scenario.model_dump(mode="json") for scenario in load_pixel_scenarios(source))
     else:
         path = Path(source) if Path(source).suffix in (".yaml", ".yml") else SCENARIOS / f"{source}.yaml"
         if not path.exists():
             names = ", ".join(sorted(one.stem for one in SCENARIOS.glob("*.yaml")))
             raise SurecutError(f"{source}: no such scenario; give a YAML file or one of {names}")
-        found = (load_scenario(path).model_dump(mode="json"),)
-    return Campaign(level, found, leave_out)
+        found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(path))
+    return Campaign(level, found, leave_out, decisions)
 
 
 def run_campaign(
@@ -91,6 +94,7 @@ def claim_folder(folder: Path, campaign: Campaign) -> None:
         "level": campaign.level,
         "scenarios": [dict(scenario) for scenario in campaign.scenarios],
         "leave_out": campaign.leave_out,
+        "decisions": campaign.decisions,
     }
     path = folder / SETTINGS
     if path.exists():

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ..estimator.result import Result
+from ..estimator.validated_range import quantities as covered
 from .evaluate import Quantity
 
 Row = dict[str, Any]
@@ -22,6 +23,7 @@ def row_of(number: int, scenario: str, result: Result, quantities: Sequence[Quan
         "reason": "",
         "quantities": [_plain(asdict(quantity)) for quantity in quantities],
         "radius95_m": [point.radius95_m for point in result.points],
+        "covered": [_plain(covered(result, point)) for point in result.points],
         "consistent": bool(consistency.passed),
         "consistency_reasons": list(consistency.reasons),
         "chi2_per_dof": {family.family: family.chi2 / family.dof for family in consistency.by_family if family.dof > 0},

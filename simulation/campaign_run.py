@@ -9,6 +9,7 @@ import numpy as np
 
 from ..factors.errors import SurecutError
 from .campaign_baseline import chain_of_run
+from .campaign_decisions import decisions_of
 from .campaign_estimate import estimate_run
 from .campaign_pixels import run_pixels
 from .campaign_row import Row, failed_row, row_of
@@ -29,16 +30,17 @@ class RunOrder:
     scenario: Mapping[str, Any]
     """A scenario of that level, as data."""
     leave_out: bool = False
+    decisions: bool = False
 
 
 def run(order: RunOrder) -> Row:
     """One run. What the input cannot give is a row with its reason; a defect raises."""
     if order.level == "pixels":
         return run_pixels(order.number, order.scenario)
-    return run_measurements(order.number, Scenario.model_validate(order.scenario), leave_out=order.leave_out)
+    return run_measurements(order.number, Scenario.model_validate(order.scenario), order.leave_out, order.decisions)
 
 
-def run_measurements(number: int, scenario: Scenario, leave_out: bool = False) -> Row:
+def run_measurements(number: int, scenario: Scenario, leave_out: bool = False, decisions: bool = False) -> Row:
     """One run at measurement level."""
     drawn = draw(scenario, number)
     begin = time.perf_counter()
@@ -51,6 +53,8 @@ def run_measurements(number: int, scenario: Scenario, leave_out: bool = False) -
     row["chain"] = chain_errors(drawn)
     if leave_out:
         row["leave_out"] = {name: _without(drawn, name) for name in leave_out_names()}
+    if decisions:
+        row["decisions"] = decisions_of(drawn, result, scenario, number)
     return row
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .campaign import write_whole
+from .campaign_decisions import Decisions, summarise_decisions
 from .campaign_row import Row, quantities_of
 from .evaluate_summary import Coverage, Summary, clopper_pearson, summarise
 
@@ -63,6 +64,7 @@ class CampaignTable:
     rejected_per_run: dict[str, float]
     events: dict[str, int]
     mean_seconds: float
+    decisions: tuple[Decisions, ...] = ()
 
 
 def tabulate(rows: Sequence[Row]) -> CampaignTable:
@@ -95,6 +97,7 @@ def tabulate(rows: Sequence[Row]) -> CampaignTable:
         },
         events=dict(Counter(kind for row in good for kind in set(row["events"]))),
         mean_seconds=float(np.mean([row.get("seconds", np.nan) for row in good])) if good else float("nan"),
+        decisions=summarise_decisions(good),
     )
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from .campaign import write_whole
+from .campaign_decisions import decisions_text
 from .campaign_report import label, quantity_text
 from .campaign_table import CampaignTable
 
@@ -11,6 +12,15 @@ INTRODUCTION = """
 Written by `surecut campaign ... --validation docs/validation.md`; do not edit by hand. Errors are truth less estimate.
 NEES is the squared error in units of the stated covariance; over many runs NEES/dof is 1 when the covariance is true,
 and stays in the interval given for it with 95 %. Coverage is how often a region of that content held the truth.
+"""
+
+
+DECISIONS = """
+Cuts with random tolerances and tools, decided by the report's rule on the stored result. The ideal rule knows the true
+covariance (same scene and faults, linearised at measurements without noise); tolerances are drawn from 0.7 to 1.4
+times those at which it is just content. A GO is wrong when truth less estimate, with the tool's own error drawn, leaves
+the tolerance; borderline are GOs up to 1.1 times that limit. Cuts of one run share its error: the interval is that of
+as many cuts as runs.
 """
 
 
@@ -54,6 +64,8 @@ def validation_section(table: CampaignTable) -> str:
             for one in table.left_out
         )
         lines.append(f"Mean error of the points without one family: {left}.")
+    if table.decisions:
+        lines += ["", DECISIONS.strip(), "", decisions_text(table.decisions), ""]
     if table.reasons:
         lines.append("Without a result: " + "; ".join(f"{count} x {text}" for text, count in table.reasons.items()))
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """Pictures of marker boards with exact truth: a supersampled page, blurred, shaded, with noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -31,6 +31,8 @@ class Photography:
     """Relative change of the light over the width and over the height of the image."""
     vignetting: float = 0.0
     """Relative loss of light in the image's corners."""
+    gamma: float = 1.0
+    """Grey values are the light to the power 1 / gamma; `black`, `white` and `background` are grey values."""
     supersampling: int = 8
 
 
@@ -62,6 +64,7 @@ def render_board(
     rng: np.random.Generator,
 ) -> NDArray[np.uint8]:
     """One 8-bit image of the board, shape (height, width). The page is white, everything else `background`."""
+    photography = _in_light(photography)
     image = np.full((camera.height, camera.width), photography.background)
     page = np.array(page_m) / 2
     outline = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*page, 0]
@@ -70,8 +73,19 @@ def render_board(
         image[y0:y1, x0:x1] = _page(board, page, camera, camera_T_f, photography, (x0, y0, x1, y1))
     image = _blurred(image, photography)
     image *= _light(camera, photography)
+    if photography.gamma != 1.0:
+        image = 255.0 * np.clip(image / 255.0, 0.0, None) ** (1.0 / photography.gamma)
     noisy = image + rng.normal(0.0, photography.noise, image.shape) if photography.noise > 0 else image
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _in_light(photography: Photography) -> Photography:
+    """Black, white and background as what the response makes grey values of."""
+    if photography.gamma == 1.0:
+        return photography
+    names = ("black", "white", "background")
+    light = {n: 255.0 * (getattr(photography, n) / 255.0) ** photography.gamma for n in names}
+    return replace(photography, **light)
 
 
 def _window(camera: CameraModel, corners: Float) -> tuple[int, int, int, int]:

@@ -4,7 +4,6 @@
 their noise: ids, stamps and covariances do not depend on it, except that a thing out of view is not measured.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, R
 from .measurement_level_board import misprinted
 from .measurement_level_machine import clicks, cloud_frames, stereo_clicks
 from .measurement_level_mobile import marker_sightings, stereo_frames
-from .measurement_level_scenario import Scenario
+from .measurement_level_scenario import Scenario, merged
 from .measurement_level_scene import Scene, build_scene, mobile_path
 from .measurement_level_truth import (
     Float,
@@ -84,7 +83,7 @@ def base_rig(scenario: Scenario, side: float, radius_m: float) -> Rig:
         ),
         pipes=(Pipe(id="pipe0", nominal_diameter_m=2 * radius_m if scenario.nominal_diameter else None),),
     )
-    return Rig.model_validate(_merge(rig.model_dump(mode="json", by_alias=True), scenario.rig))
+    return Rig.model_validate(merged(rig.model_dump(mode="json", by_alias=True), scenario.rig))
 
 
 def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
@@ -187,12 +186,3 @@ def _model(camera: TrueCamera, baseline_m: float) -> CameraModel:
         rectification=np.eye(3),
         baseline_m=baseline_m if camera.name == "m_right" else None,
     )
-
-
-def _merge(base: dict, extra: Mapping) -> dict:
-    """`extra` laid over `base`, mappings merged key by key."""
-    merged = dict(base)
-    for key, value in extra.items():
-        old = merged.get(key)
-        merged[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, Mapping) else value
-    return merged

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ..estimator.view_cells import ViewCells
 from ..factors.measurements import MarkerSighting, StereoFrame
 from .measurement_level_board import corners_on_page, inwards, knocked
 from .measurement_level_scenario import BoardFaults
@@ -11,8 +12,6 @@ from .measurement_level_truth import Float, TrueCamera, invert, matrix, transfor
 from .measurement_level_world import World, inside, project, spoil
 
 Bool = NDArray[np.bool_]
-PLACE_M = 0.1
-"""Views from within this distance share the common part of a corner's error."""
 
 
 def stereo_frames(world: World) -> list[StereoFrame]:
@@ -102,18 +101,21 @@ def marker_sightings(world: World) -> list[MarkerSighting]:
     """All markers in all images of the mobile pair: whole in the image, large enough, not too oblique."""
     sightings = []
     for name, m_T_camera in (("m_left", np.eye(4)), ("m_right", world.true.m_left_T_m_right)):
-        common = {}
+        common: dict[tuple[str, int, int], Float] = {}
+        cells = {board: ViewCells() for board in world.true.boards}
         for stamp_ns, w_T_m in zip(world.stamps_ns, world.w_T_m, strict=True):
             for page in world.true.boards.values():
                 faults = world.scenario.board if page.id == world.rig.boards[0].id else BoardFaults()
                 seconds = 1e-9 * (stamp_ns - world.stamps_ns[0])
                 w_T_f = knocked(world.w_T_f[page.id], faults, seconds)
+                # Views from one place share a part of their error, and what one place is the model says.
+                cells[page.id].count(stamp_ns, invert(w_T_f) @ w_T_m)
                 for marker, corners_f in corners_on_page(page, faults, seconds).items():
                     corners_w = transform(w_T_f, corners_f)
                     exact_px = _whole_marker(world, world.true.cameras[name], w_T_m @ m_T_camera, corners_w)
                     if exact_px is None:
                         continue
-                    place = (page.id, marker, *np.floor(w_T_m[:3, 3] / PLACE_M))
+                    place = (page.id, marker, cells[page.id].cell)
                     if place not in common:
                         common[place] = world.rng.normal(0.0, world.rig.noise.marker_common_px, (4, 2))
                     found_px = inwards(exact_px, faults.inset_px) + common[place]

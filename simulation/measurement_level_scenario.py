@@ -1,7 +1,8 @@
 """What a run at measurement level is made of: a scenario file (YAML), unknown keys are errors."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import Field, ValidationError
@@ -11,6 +12,7 @@ from ..factors.rig import NonNegative, Positive, Section
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=0)]
+Interval = tuple[Positive, Positive]
 
 
 class Outliers(Section):
@@ -38,11 +40,25 @@ class NoiseFactors(Section):
     outlines: Positive = 1.0
 
 
+class PipePlace(Section):
+    """Where the pipe stands: uniform between two limits."""
+
+    distance_m: Interval = (1.9, 2.2)
+    """Before the machine. The panel, if there is one, stands at 1.45 m."""
+    offset_m: tuple[float, float] = (-0.25, 0.25)
+    """To the machine's left."""
+
+
 class Motion(Section):
     """The mobile camera's way: in front of the board, round the panel, three places with the pipe in view."""
 
     duration_s: Positive = 20.0
-    keyframe_rate_hz: Positive = 3.0
+    keyframe_turn_rad: Positive = 0.2
+    """A keyframe at the latest after this turn, this way, and this time: the map has to stay in view."""
+    keyframe_way_m: Positive = 0.25
+    keyframe_time_s: Positive = 1.0
+    board_distance_m: Interval = (1.0, 1.25)
+    """Of the camera from the board when it first sees it."""
     board_share: Annotated[float, Field(gt=0.0, lt=0.8)] = 0.3
     """Share of the time spent before the board."""
     style: Literal["smooth", "sharp"] = "smooth"
@@ -53,11 +69,11 @@ class Motion(Section):
 class Tracks(Section):
     """Features of the mobile stereo pair."""
 
-    per_frame: Count = 80
+    per_frame: Count = 70
     sigma_px: Positive = 0.25
     right_share: Share = 0.9
     """Share of the features that are found in the right image too."""
-    mean_life_frames: Positive = 12.0
+    mean_life_frames: Positive = 20.0
     motion_sigma_m: NonNegative = 0.003
     motion_sigma_rad: NonNegative = 0.0006
     """Of the front end's motion from frame to frame: a first guess only."""
@@ -72,7 +88,7 @@ class Clouds(Section):
     """Kinect depth images. 0 frames: no Kinect."""
 
     frames: Count = 2
-    points: Count = 3000
+    points: Count = 2000
 
 
 class Picks(Section):
@@ -118,6 +134,7 @@ class Scenario(Section):
     baseline_m: Positive = 0.15
     panel: bool = True
     """A panel hides the pipe from the Kinect."""
+    pipe: PipePlace = PipePlace()
     motion: Motion = Motion()
     tracks: Tracks = Tracks()
     markers: Markers = Markers()
@@ -136,8 +153,8 @@ class Scenario(Section):
     """Merged into the rig file of the runs, key by key."""
 
 
-def load_scenario(path: Path) -> Scenario:
-    """The scenario of a YAML file.
+def load_scenarios(path: Path) -> tuple[Scenario, ...]:
+    """The scenarios of a YAML file: one, or with `runs` one for each of its entries, laid over the common keys.
 
     Raises:
         RigError: the file cannot be read, is no YAML, or a key or value is wrong; names file and key.
@@ -148,9 +165,22 @@ def load_scenario(path: Path) -> Scenario:
         raise RigError(f"{path}: cannot be read ({error.strerror}); give a scenario file or name") from error
     except yaml.YAMLError as error:
         raise RigError(f"{path}: is no YAML ({' '.join(str(error).split())})") from error
+    data = data or {}
+    if not isinstance(data, dict) or not isinstance(data.get("runs", []), list):
+        raise RigError(f"{path}: is no scenario; it must hold keys such as motion, tracks and picks")
+    common = {key: value for key, value in data.items() if key != "runs"}
     try:
-        return Scenario.model_validate(data or {})
+        return tuple(Scenario.model_validate(merged(common, one)) for one in data.get("runs") or [{}])
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "scenario"
         raise RigError(f"{path}: {where}: {first['msg']}") from error
+
+
+def merged(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """`extra` laid over `base`, mappings key by key."""
+    found = dict(base)
+    for key, value in extra.items():
+        old = found.get(key)
+        found[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, Mapping) else value
+    return found

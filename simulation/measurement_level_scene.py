@@ -15,6 +15,9 @@ from .measurement_level_truth import Float, matrix
 
 Bool = NDArray[np.bool_]
 
+FRAME_RATE_HZ = 15.0
+"""Keyframes are chosen among this many."""
+
 
 @dataclass(frozen=True, slots=True)
 class Rectangles:
@@ -57,7 +60,7 @@ class Scene:
 def build_scene(scenario: Scenario, radius_m: float, rng: np.random.Generator) -> Scene:
     """A room with machine front, panel, crates and the pipe at a random place."""
     side = float(rng.choice([-1.0, 1.0]))
-    pipe_xy = np.array([rng.uniform(1.9, 2.2), rng.uniform(-0.25, 0.25)])
+    pipe_xy = np.array([rng.uniform(*scenario.pipe.distance_m), rng.uniform(*scenario.pipe.offset_m)])
     tilt = rng.normal(0.0, 0.03, 2)
     axis = np.array([tilt[0], tilt[1], 1.0])
     pipe = Cylinder(np.array([*pipe_xy, 0.2]), axis / np.linalg.norm(axis), 2.2, radius_m)
@@ -83,16 +86,17 @@ def mobile_path(scene: Scene, board: Float, motion: Motion, rng: np.random.Gener
     Args:
         scene: the cell.
         board: the board's centre, shape (3,).
-        motion: duration, rate, style.
+        motion: duration, keyframes, style.
         rng: the run's generator.
 
     Returns:
-        Times in s, shape (n,); `w_T_m`, shape (n, 4, 4); times of the three places, shape (3,).
+        Keyframes: times in s, shape (n,); `w_T_m`, shape (n, 4, 4); times of the three places, shape (3,).
     """
     share, end = motion.board_share, motion.duration_s
     pipe = scene.pipe.base + 1.0 * scene.pipe.axis
     turn = rng.uniform(-0.1, 0.1, (8, 3))
-    start = board + rng.uniform([1.0, -0.25, -0.1], [1.25, 0.25, 0.15])
+    near, far = motion.board_distance_m
+    start = board + rng.uniform([near, -0.25, -0.1], [far, 0.25, 0.15])
     places = [pipe + _around(angle, scene.side, rng.uniform(0.9, 1.3)) for angle in (-0.7, 0.0, 0.7)]
     way = np.array(
         [
@@ -114,13 +118,29 @@ def mobile_path(scene: Scene, board: Float, motion: Motion, rng: np.random.Gener
         stops = 0.7 * stops
     else:
         way, looks, times = np.vstack([way, way[-1]]), np.vstack([looks, looks[-1]]), np.r_[times, end]
-    stamps_s = np.arange(0.0, end, 1.0 / motion.keyframe_rate_hz)
+    stamps_s = np.arange(0.0, end, 1.0 / FRAME_RATE_HZ)
     positions, targets = CubicSpline(times, way)(stamps_s), CubicSpline(times, looks)(stamps_s)
     roll = 0.05 * np.sin(2 * np.pi * (stamps_s / 3.0 + rng.uniform()))
     if motion.style == "sharp":
         targets = targets + _jerks(stamps_s, rng)
         roll = roll + 0.2 * np.sin(2 * np.pi * stamps_s / 1.3)
-    return stamps_s, _look_at(positions, targets, roll), stops
+    w_T_m = _look_at(positions, targets, roll)
+    chosen = _keyframes(stamps_s, w_T_m, stops, motion)
+    return stamps_s[chosen], w_T_m[chosen], stops
+
+
+def _keyframes(stamps_s: Float, w_T_m: Float, stops: Float, motion: Motion) -> list[int]:
+    """Frames at which a front end would make keyframes; the places are among them."""
+    places = {int(np.abs(stamps_s - stop).argmin()) for stop in stops}
+    chosen = [0]
+    for i in range(1, len(stamps_s)):
+        last = chosen[-1]
+        cosine = 0.5 * (np.trace(w_T_m[last, :3, :3].T @ w_T_m[i, :3, :3]) - 1.0)
+        turned = np.arccos(np.clip(cosine, -1.0, 1.0)) >= motion.keyframe_turn_rad
+        moved = np.linalg.norm(w_T_m[i, :3, 3] - w_T_m[last, :3, 3]) >= motion.keyframe_way_m
+        if turned or moved or stamps_s[i] - stamps_s[last] >= motion.keyframe_time_s or i in places:
+            chosen.append(i)
+    return chosen
 
 
 def occluded(eyes: Float, points: Float, surfaces: Rectangles, pipe: Cylinder | None = None) -> Bool:

@@ -22,6 +22,10 @@ def difference(a, b, sigma):
     return gtsam.CustomFactor(sigmas([sigma]), [a, b], error)
 
 
+ONE = [(1, np.eye(1))]
+"""The variable 1 itself."""
+
+
 def system_of(factors, keys):
     values = gtsam.Values()
     for key in keys:
@@ -36,9 +40,9 @@ def test_a_scalar_measured_again():
     """Sigma 3 measured once more with sigma 4: 1 / (1/9 + 1/16) = 5.76."""
     system, values = system_of([scalar_prior(1, 3.0)], [1])
     joint = Joint.of(system, [1])
-    after = joint.with_rows(joint.rows([Predicted(scalar_prior(1, 4.0))], values))
+    rows = joint.rows([Predicted(scalar_prior(1, 4.0))], values)
     assert joint.covariance[0, 0] == pytest.approx(9.0)
-    assert after.covariance[0, 0] == pytest.approx(5.76)
+    assert joint.after(rows, ONE)[0, 0] == pytest.approx(5.76)
 
 
 def test_a_new_variable_passes_on_what_is_known_of_it():
@@ -48,7 +52,7 @@ def test_a_new_variable_passes_on_what_is_known_of_it():
     values.insert(2, np.zeros(1))
     rows = joint.rows([Predicted(difference(1, 2, 2.0)), Predicted(scalar_prior(2, 1.0))], values)
     assert rows.W.shape == (1, 1)
-    assert joint.with_rows(rows).covariance[0, 0] == pytest.approx(1 / (1 / 9 + 1 / 5))
+    assert joint.after(rows, ONE)[0, 0] == pytest.approx(1 / (1 / 9 + 1 / 5))
 
 
 def test_a_new_variable_that_nothing_else_holds_says_nothing():
@@ -56,7 +60,7 @@ def test_a_new_variable_that_nothing_else_holds_says_nothing():
     joint = Joint.of(system, [1])
     values.insert(2, np.zeros(1))
     rows = joint.rows([Predicted(difference(1, 2, 2.0))], values)
-    assert joint.with_rows(rows).covariance[0, 0] == pytest.approx(9.0)
+    assert joint.after(rows, ONE)[0, 0] == pytest.approx(9.0)
 
 
 def test_correlated_errors_keep_their_weights():
@@ -66,10 +70,10 @@ def test_correlated_errors_keep_their_weights():
     joint = Joint.of(system, [1])
     assert joint.covariance[0, 0] == pytest.approx(1.0)
     # A third, honest one is weighed with a third: 1/9 + (2 + 2)/9.
-    after = joint.with_rows(joint.rows([Predicted(scalar_prior(1, 1.0))], values))
-    assert after.covariance[0, 0] == pytest.approx(5 / 9)
-    inflated = joint.with_rows(joint.rows([Predicted(scalar_prior(1, 1.0), 2.0)], values))
-    assert inflated.covariance[0, 0] == pytest.approx(6 / 9)
+    honest = joint.rows([Predicted(scalar_prior(1, 1.0))], values)
+    assert joint.after(honest, ONE)[0, 0] == pytest.approx(5 / 9)
+    inflated = joint.rows([Predicted(scalar_prior(1, 1.0), 2.0)], values)
+    assert joint.after(inflated, ONE)[0, 0] == pytest.approx(6 / 9)
 
 
 def test_adding_equals_rebuilding():
@@ -81,17 +85,18 @@ def test_adding_equals_rebuilding():
     system, values = system_of(factors, keys)
     whole, _ = system_of(factors + extra, keys)
     joint = Joint.of(system, [2, 3, 5, 6])
-    after = joint.with_rows(joint.rows([Predicted(f) for f in extra], values))
-    np.testing.assert_allclose(after.covariance, whole.joint([2, 3, 5, 6]), rtol=1e-9)
+    rows = joint.rows([Predicted(f) for f in extra], values)
+    all_of_it = [(key, np.eye(4)[:, i : i + 1]) for i, key in enumerate([2, 3, 5, 6])]
+    np.testing.assert_allclose(joint.after(rows, all_of_it), whole.joint([2, 3, 5, 6]), rtol=1e-9)
     np.testing.assert_allclose(joint.covariance, system.joint([2, 3, 5, 6]), rtol=1e-9)
     J = rng.normal(size=(2, 1))
-    np.testing.assert_allclose(after.of_blocks([(3, J), (6, -J)]), whole.covariance([(3, J), (6, -J)]), rtol=1e-9)
+    np.testing.assert_allclose(joint.after(rows, [(3, J), (6, -J)]), whole.covariance([(3, J), (6, -J)]), rtol=1e-9)
 
 
 def test_no_rows_change_nothing():
     system, _ = system_of([scalar_prior(1, 3.0)], [1])
     joint = Joint.of(system, [1])
-    assert joint.with_rows(Rows(np.zeros((0, 1)), np.zeros((0, 0)))) is joint
+    assert joint.after(Rows(np.zeros((0, 1)), np.zeros((0, 0))), ONE)[0, 0] == pytest.approx(9.0)
 
 
 def test_measuring_rows_again_equals_rebuilding():

@@ -7,22 +7,26 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
+from surecut.estimator.decision import tolerance_probability
 from surecut.estimator.executor import SerialExecutor
+from surecut.estimator.validated_range import QUANTITIES, load_validated_range, range_text, seal
 from surecut.factors.errors import SurecutError
 from surecut.simulation import campaign as campaign_module
 from surecut.simulation.campaign import Campaign, failures, open_campaign, run_campaign
+from surecut.simulation.campaign_decisions import _cuts, ideal_covariances
+from surecut.simulation.campaign_range import validated_range
 from surecut.simulation.campaign_report import report_html
 from surecut.simulation.campaign_row import failed_row, quantities_of
 from surecut.simulation.campaign_run import run_measurements
 from surecut.simulation.campaign_table import coverage_at, tabulate, write_tables
 from surecut.simulation.campaign_validation import update_validation
 from surecut.simulation.evaluate import point_quantity, scalar_quantity
-from surecut.simulation.measurement_level_scenario import Scenario
+from surecut.simulation.measurement_level_scenario import Scenario, load_scenarios
 
 SHORT = Scenario.model_validate(
     {
         "name": "short",
-        "motion": {"duration_s": 16.0, "keyframe_rate_hz": 3.0},
+        "motion": {"duration_s": 16.0},
         "tracks": {"per_frame": 50},
         "clouds": {"frames": 0},
     }
@@ -126,10 +130,68 @@ def test_scenarios_that_come_along_are_valid(name):
     assert scenario["name"] == name
 
 
-def test_paper_b_is_nine_recordings_at_pixel_level():
-    campaign = open_campaign("paper-b", "pixels")
+@pytest.mark.parametrize("level", ["pixels", "measurements"])
+def test_paper_b_is_nine_runs_at_both_levels(level):
+    campaign = open_campaign("paper-b", level)
     assert len(campaign.scenarios) == 9
     assert campaign.order(11).scenario["name"] == "paper-b-a3"
+
+
+@pytest.mark.parametrize(
+    ("name", "level"), [("paper-a", "pixels"), ("paper-a", "measurements"), ("validation", "pixels")]
+)
+def test_campaigns_of_several_conditions(name, level):
+    assert len({one["name"] for one in open_campaign(name, level).scenarios}) >= 3
+
+
+def test_entries_of_a_scenario_file_lie_over_its_common_keys(tmp_path):
+    file = tmp_path / "two.yaml"
+    file.write_text("motion: {duration_s: 9}\nruns:\n  - {name: a}\n  - {name: b, motion: {style: sharp}}\n")
+    a, b = load_scenarios(file)
+    assert (a.name, a.motion.duration_s, a.motion.style) == ("a", 9.0, "smooth")
+    assert (b.name, b.motion.duration_s, b.motion.style) == ("b", 9.0, "sharp")
+
+
+def test_a_validated_range_spans_what_the_runs_covered_and_refuses_what_refutes_it(tmp_path):
+    covered = [dict.fromkeys(QUANTITIES, value + 1.0) for value in range(50)]
+    rows = [rows_with(3.0) | {"run": i, "covered": [covered[i]]} for i in range(50)]
+    rows.append(rows_with(3.0, passed=False) | {"covered": [{"distance_m": 99.0}]})
+    found = validated_range(rows, "measurements", "2030-01-01, commit a")
+    assert (found.runs, found.coverage95, found.level) == (50, 1.0, "measurements")
+    assert found.ranges["distance_m"] == (1.0, 50.0)
+    file = tmp_path / "range.yaml"
+    file.write_text(range_text(found))
+    assert load_validated_range(file) == seal(found)
+    with pytest.raises(SurecutError, match="give more --runs"):
+        validated_range(rows[:20], "measurements", "")
+    with pytest.raises(SurecutError, match="validates nothing"):
+        validated_range([row | rows_with(30.0) for row in rows], "measurements", "")
+
+
+def test_decisions_count_wrong_gos_among_the_gos():
+    cuts = [
+        {"allowed": 0.05, "factor": 1.05, "ideal": True, "go": True, "inside": True},
+        {"allowed": 0.05, "factor": 1.3, "ideal": True, "go": True, "inside": False},
+        {"allowed": 0.05, "factor": 0.9, "ideal": False, "go": False, "inside": False},
+        {"allowed": 0.01, "factor": 1.2, "ideal": True, "go": False, "inside": False},
+    ]
+    five, one = tabulate([rows_with(3.0) | {"decisions": cuts}]).decisions
+    assert (five.cuts, five.go, five.ideal_go, five.wrong) == (3, pytest.approx(2 / 3), pytest.approx(2 / 3), 0.5)
+    assert (five.border, five.border_wrong) == (1, 0.0)
+    assert (one.cuts, one.go, one.ideal_go, one.wrong) == (1, 0.0, 1.0, 0.0)
+
+
+def test_the_ideal_covariance_is_that_of_the_estimate_but_for_its_noise(short_rows):
+    ideal = ideal_covariances(SHORT, 0)["P1"]
+    stated = next(q for q in quantities_of(short_rows[0]) if q.name == "P1").sigma
+    assert np.sqrt(np.trace(ideal)) == pytest.approx(stated, rel=0.25)
+
+
+def test_the_ideal_rule_is_just_content_at_factor_one():
+    covariance, axis = np.diag([4e-6, 1e-6, 9e-6]), np.array([0.0, 0.0, 1.0])
+    for cut, factor in _cuts("P1", covariance, axis, np.random.default_rng(0)):
+        held = tolerance_probability(cut, covariance, axis)
+        assert (held >= 1 - cut.wrong_go_probability) == (factor >= 1.0)
 
 
 def test_an_unknown_scenario_names_those_that_there_are():

@@ -8,7 +8,7 @@ from scipy.stats import chi
 
 from surecut.estimator.decision import along_room_m, decide, decide_cut, percent, tolerance_probability
 from surecut.estimator.result import NearestSurface, PipeEstimate
-from surecut.estimator.validated_range import ValidatedRange
+from surecut.estimator.validated_range import ValidatedRange, load_validated_range, range_text
 from surecut.factors.errors import SurecutError
 from surecut.factors.measurements import Event
 from surecut.factors.rig import Box, Cut
@@ -250,12 +250,23 @@ def test_whole_rule_against_sampled_ideal():
 
 
 def test_validated_range_file(tmp_path):
-    from surecut.estimator.validated_range import load_validated_range
-
     file = tmp_path / "range.yaml"
-    file.write_text("document: d\nruns: 3\ncoverage95: 0.9\nnees_per_dof: 1\nranges: {distance_m: [1, 2]}\n")
-    assert load_validated_range(file).ranges == {"distance_m": (1.0, 2.0)}
-    for text in ("{", "runs: 3", "document: d\nruns: 3\ncoverage95: 1\nnees_per_dof: 1\nranges: {colour: [1, 2]}"):
+    sealed = range_text(VALIDATED)
+    file.write_text(sealed)
+    assert load_validated_range(file).ranges == {"distance_m": (0.5, 4.0)}
+    tampered = (
+        sealed.replace("- 4.0", "- 40.0"),
+        sealed.replace("runs: 300", "runs: 3000"),
+        sealed[: sealed.index("digest")],
+    )
+    for text in tampered:
+        file.write_text(text)
+        with pytest.raises(SurecutError, match="digest mismatch") as caught:
+            load_validated_range(file)
+        assert "\n" not in str(caught.value)
+    refuted = range_text(VALIDATED.model_copy(update={"coverage95": 0.8}))
+    unknown = "document: d\nruns: 3\ncoverage95: 1\nnees_per_dof: 1\nranges: {colour: [1, 2]}"
+    for text in ("{", "runs: 3", unknown, refuted):
         file.write_text(text)
         with pytest.raises(SurecutError, match="is no validated range") as caught:
             load_validated_range(file)

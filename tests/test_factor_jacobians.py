@@ -1,11 +1,14 @@
 """Every Python factor's Jacobians against central differences."""
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
 
 from surecut.factors import board, cloud, keys, pipe
-from surecut.factors.noise import sigmas
+from surecut.factors.measurements import CylinderSighting
+from surecut.factors.noise import gaussian, sigmas
 from surecut.factors.rig import Board, Marker
 
 RNG = np.random.default_rng(1)
@@ -111,6 +114,7 @@ def test_plane_factor():
     values.insert(keys.base(0), a_pose())
     values.insert(keys.landmark(5), RNG.normal(0, 1, 3))
     values.insert(keys.DEPTH, np.array([0.01, -0.004]))
+    values.insert(keys.DEPTH_RAYS, np.array([0.002, -0.001, 0.003]))
     normal = np.array([0.3, -0.2, -0.93])
     normal /= np.linalg.norm(normal)
     factor = cloud.plane_factor(keys.base(0), keys.landmark(5), np.array([0.4, -0.3, 2.0]), normal, sigmas([0.01]))
@@ -159,6 +163,38 @@ def test_cylinder_factor():
     values = gtsam.Values()
     a_pipe(values)
     values.insert(keys.base(0), gtsam.Pose3.Expmap(RNG.normal(0, 0.1, 6)))
-    fit = (np.array([0.1, -0.2, 1.45]), np.array([0.12, 0.3, 1.52]))
-    factor = pipe.cylinder_factor(*fit, 0.05, np.eye(5) * 1e-4, keys.base(0), 0)
+    values.insert(keys.DEPTH, np.array([0.01, -0.004]))
+    values.insert(keys.DEPTH_RAYS, np.array([0.002, -0.001, 0.003]))
+    seen = cylinder_sighting()
+    np.testing.assert_allclose(pipe.cylinder_covariance(seen), np.eye(5) * 1e-4, atol=1e-12)
+    factor = pipe.cylinder_factor(seen, gaussian(pipe.cylinder_covariance(seen)), keys.base(0), 0)
     check(factor, values, whitener(factor.noiseModel()))
+
+
+def cylinder_sighting():
+    a, b = np.array([0.1, -0.2, 1.45]), np.array([0.12, 0.3, 1.52])
+    axis = (b - a) / np.linalg.norm(b - a)
+    across = np.kron(np.eye(2), np.eye(3) - np.outer(axis, axis))
+    information = np.block([[across, np.zeros((6, 1))], [np.zeros((1, 6)), np.ones((1, 1))]]) / 1e-4
+    response = np.random.default_rng(4).normal(0, 1, (7, 5))
+    return CylinderSighting(5, "b_depth", "pipe0", a, b, 0.05, information, 900, 0.001, "kinect_cloud", response)
+
+
+def test_a_cylinder_seen_too_far_by_the_depth_offset():
+    # The true pipe is 20 mm nearer than the depth camera says: an offset of -20 mm explains the whole residual.
+    a, b, r = np.array([0.0, -0.3, 1.5]), np.array([0.0, 0.3, 1.5]), 0.05
+    response = np.zeros((7, 5))
+    response[[2, 5], 0] = 1.0
+    back = np.array([0.0, 0.0, 0.02])
+    seen = dataclasses.replace(cylinder_sighting(), point_a_m=a + back, point_b_m=b + back, by_depth=response)
+    values = gtsam.Values()
+    values.insert(keys.base(0), gtsam.Pose3())
+    for key, point in ((keys.axis_start(0), a), (keys.axis_end(0), b)):
+        values.insert(key, point)
+    values.insert(keys.radius(0), np.array([r]))
+    values.insert(keys.DEPTH, np.array([-0.02, 0.0]))
+    values.insert(keys.DEPTH_RAYS, np.zeros(3))
+    factor = pipe.cylinder_factor(seen, gaussian(np.eye(5) * 1e-4), keys.base(0), 0)
+    np.testing.assert_allclose(factor.unwhitenedError(values), 0, atol=1e-12)
+    values.update(keys.DEPTH, np.zeros(2))
+    assert np.linalg.norm(factor.unwhitenedError(values)) == pytest.approx(0.02 * np.sqrt(2), rel=1e-6)

@@ -41,6 +41,20 @@ def test_no_bias_and_an_honest_covariance(focal, distance, tilt, blur, noise):
     assert 0.6 < nees.mean() < 1.5
 
 
+@pytest.mark.parametrize(("gamma", "blur"), [(2.2, 0.7), (1.6, 1.0), (0.7, 0.9)])
+def test_the_response_of_the_camera_moves_no_corner(gamma, blur):
+    """Between black and white a camera's response is bent: that shifts all edges towards one side of them."""
+    lens = camera(230, 230, 270)
+    poses = [pose(20.0, 70.0 * k, 23.0 * k, [0.001 * k, 0.002, 0.6]) for k in range(6)]
+    # ink throws back 6 % of what paper does
+    taken = Photography(blur_px=blur, gamma=gamma, black=225.0 * 0.06 ** (1.0 / gamma))
+    errors, outward, nees = measure(a4_board(), lens, poses, taken)
+    assert len(errors) == 24
+    assert abs(outward.mean()) < 0.02
+    assert np.sqrt((errors**2).mean()) < 0.05
+    assert 0.5 < nees.mean() < 1.6
+
+
 def test_motion_blur_moves_no_corner():
     lens = camera(300, 300, 400)
     poses = [pose(20.0, 50.0 * k, 31.0 * k, [0.0, 0.0, 0.6]) for k in range(4)]

@@ -81,4 +81,4 @@ def test_what_nothing_determines_is_named(key, value, words):
     values.insert(key, value)
     graph.add(gtsam.RangeFactor3(key, keys.corner(0, 0), 1.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.1)))
     with pytest.raises(ObservabilityError, match=f"{words} is not observable"):
-        LinearSystem(graph, values)
+        LinearSystem(graph, values).joint([keys.landmark(0)])

@@ -10,7 +10,7 @@ from surecut.factors.errors import RigError
 from surecut.factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from surecut.factors.outline import outline_noise, outline_residual
 from surecut.simulation.measurement_level import draw
-from surecut.simulation.measurement_level_scenario import Scenario, load_scenario
+from surecut.simulation.measurement_level_scenario import Scenario, load_scenarios
 from surecut.simulation.measurement_level_truth import invert, transform
 
 
@@ -231,6 +231,6 @@ def test_scenario_errors_name_file_and_key(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text("tracks: {per_fram: 3}\n")
     with pytest.raises(RigError, match=r"s\.yaml: tracks\.per_fram"):
-        load_scenario(path)
+        load_scenarios(path)
     with pytest.raises(RigError, match="cannot be read"):
-        load_scenario(tmp_path / "none.yaml")
+        load_scenarios(tmp_path / "none.yaml")

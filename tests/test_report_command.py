@@ -15,6 +15,7 @@ from surecut.estimator.cli import main
 from surecut.estimator.report.content import build_document
 from surecut.estimator.report.pdf import render_pdf
 from surecut.estimator.result_json import from_json, to_json
+from surecut.estimator.validated_range import range_text
 from surecut.factors.rig import dump_rig
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -23,7 +24,7 @@ BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil
 @pytest.fixture
 def validation(tmp_path):
     file = tmp_path / "validated.yaml"
-    file.write_text(json.dumps(VALIDATED.model_dump(mode="json")))
+    file.write_text(range_text(VALIDATED))
     return str(file)
 
 

@@ -31,6 +31,8 @@ def world(landmarks):
     graph.add(gtsam.PriorFactorPose3(keys.base(0), gtsam.Pose3(), sigmas([1e-9] * 6)))
     values.insert(keys.DEPTH, np.zeros(2))
     graph.add(gtsam.PriorFactorVector(keys.DEPTH, np.zeros(2), sigmas([0.004, 1e-9])))
+    values.insert(keys.DEPTH_RAYS, np.zeros(3))
+    graph.add(gtsam.PriorFactorVector(keys.DEPTH_RAYS, np.zeros(3), sigmas([1e-9] * 3)))
     values.insert(keys.point(0), np.zeros(3))
     graph.add(gtsam.PriorFactorPoint3(keys.point(0), np.zeros(3), sigmas([POINT_SIGMA] * 3)))
     for i, place in enumerate(landmarks):

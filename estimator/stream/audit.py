@@ -7,8 +7,8 @@ import numpy as np
 
 from ...factors import keys
 from ..consistency import family_tests, judge, prior_tests
-from ..correlation import inflated_system
 from ..engine import Engine
+from ..linearised import linearise, with_correlated_tracks
 from ..marginal import FAMILY
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
@@ -34,12 +34,12 @@ def audit(engine: Engine) -> Audit:
     mostly made of them, and cannot be told apart any more."""
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     values, log = engine.state.values, engine.solver.log
-    active = list(log.active())
-    system, inflation = inflated_system(active, values, ODOMETRY)
-    earlier = np.array([record.family == FAMILY for _, _, record in active])
-    system.inflation[np.repeat(earlier, system.rows)] = inflation
-    families = family_tests(log, active, system, values, engine.rig.gates.robust_sigma)
-    consistency = judge(tuple(f for f in families if f.family != FAMILY), prior_tests(active, system, TESTED), {})
+    at = with_correlated_tracks(linearise(log, (), values, engine.rig.gates.robust_sigma), ODOMETRY)
+    system = at.system
+    earlier = np.array([record.family == FAMILY for _, _, record in at.active])
+    system.inflation[np.repeat(earlier, system.rows)] = at.inflation
+    families = tuple(f for f in family_tests(at) if f.family != FAMILY)
+    consistency = judge(families, prior_tests(at.active, system, TESTED), {})
     widening = {}
     if values.exists(keys.base(0)):
         for point in engine.pipes.points.values():

@@ -24,7 +24,7 @@ Float = NDArray[np.float64]
 FROZEN = "frozen"
 INTRINSICS = ("fx", "fy", "skew", "cx", "cy", "k1", "k2", "p1", "p2")
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
-HOLD = {"k": [1e-3, 1e-3, 1e-5, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6], "e": [1e-6] * 6, "d": [1e-6] * 2}
+HOLD = {"k": [1e-3, 1e-3, 1e-5, 1e-3, 1e-3, 1e-6, 1e-6, 1e-6, 1e-6], "e": [1e-6] * 6, "d": [1e-6] * 2, "g": [1e-6] * 3}
 """Sigmas with which a calibration is held: a hundredth of what matters."""
 
 

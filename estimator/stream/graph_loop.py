@@ -92,7 +92,7 @@ class GraphLoop:
             raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
         new = self.engine.odometry.last_keyframe > before
         clicked = bool(sensed.bundle.picks)
-        self._changed |= new or clicked or sensed.cloud is not None
+        self._changed |= new or clicked or sensed.depth is not None
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)

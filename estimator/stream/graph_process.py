@@ -94,7 +94,7 @@ def _obeyed(loop: GraphLoop, order: Order, task: GraphTask, out: Any) -> GraphLo
 
 def _finish(loop: GraphLoop, out: Any) -> None:
     """The last answer, with everything that waited."""
-    loop.engine.revisit()
+    loop.pipeline.complete()
     loop.engine.flush()
     loop.mark_changed()
     loop.answer(loop.engine.end_ns)

@@ -51,6 +51,8 @@ class Memory:
     distances_open: list[int]
     """Places in the rig's list of those that have not entered."""
     inset_sigma_px: list[tuple[str, str, float]]
+    cylinders: list[str]
+    """Pipes that the machine's depth camera has seen."""
 
 
 def remember(engine: Engine) -> Memory | None:
@@ -98,6 +100,7 @@ def remember(engine: Engine) -> Memory | None:
         mounted=engine.mounted,
         distances_open=[engine.rig.distances.index(d) for d in engine.distances_open],
         inset_sigma_px=[(*key, sigma) for key, sigma in engine.boards.inset_sigma_px.items()],
+        cylinders=sorted(_seen_by_machine(engine)),
     )
 
 
@@ -133,7 +136,13 @@ def recall(engine: Engine, memory: Memory) -> None:
     for stored in memory.pipes:
         given = next((p for p in engine.rig.pipes if p.id == stored["id"]), Pipe(id=stored["id"]))
         engine.pipes.cylinders[stored["id"]] = known_cylinder(stored["index"], given, stored["outlines"])
+    engine.depth_pipes.remembered = {(pipe, engine.base) for pipe in memory.cylinders}
     engine.resume(update, memory.keyframes, memory.mounted, [engine.rig.distances[i] for i in memory.distances_open])
+
+
+def _seen_by_machine(engine: Engine) -> set[str]:
+    entered = {pipe for (pipe, _), seen in engine.depth_pipes.seen.items() if seen.entered}
+    return entered | {pipe for pipe, _ in engine.depth_pipes.remembered}
 
 
 # The file -------------------------------------------------------------------------------------------------------------
@@ -175,6 +184,7 @@ def to_json(memory: Memory, rig_sha256: str) -> str:
         "mounted": memory.mounted,
         "distances_open": memory.distances_open,
         "inset_sigma_px": memory.inset_sigma_px,
+        "cylinders": memory.cylinders,
     }
     return json.dumps(body, allow_nan=False) + "\n"
 
@@ -208,6 +218,7 @@ def from_json(text: str, name: str = "checkpoint") -> Memory:
         return Memory(
             int(data["stamp_ns"]), int(data["keyframes"]), prior, cameras, data["boards"], data["points"],
             data["pipes"], bool(data["mounted"]), [int(i) for i in data["distances_open"]], insets,
+            [str(pipe) for pipe in data["cylinders"]],
         )  # fmt: skip
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         what = " ".join(str(error).split())[:120]

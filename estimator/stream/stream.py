@@ -160,6 +160,14 @@ class Stream:
         self._stopping.set()
         self._queue.close()
 
+    def pids(self) -> list[int]:
+        """Front ends' and graph's processes."""
+        return self._children.pids()
+
+    def stamp_ns(self) -> int:
+        """Newest stamp that was worked on."""
+        return self._stamp_ns
+
     def answer(self) -> Answer | None:
         """What the graph said last."""
         return self._answer

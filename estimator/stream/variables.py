@@ -4,7 +4,7 @@ import gtsam
 
 from ...factors import keys
 
-LONG_LIVED = "kedbfhqpuvr"
+LONG_LIVED = "kedgbfhqpuvr"
 """Calibration, depth, machine, boards with page and corners, points, and pipes, by the letter of their key."""
 
 

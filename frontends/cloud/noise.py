@@ -18,6 +18,9 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 DepthModel = Literal["kinect_v1", "kinect_v2", "azure", "realsense"]
 
+SMOOTH_SHARE = 0.005
+"""Slowly varying depth error across the image, as a part of the depth: lens and disparity distortion that factory
+calibration leaves (Herrera, Kannala, Heikkila 2012, find up to 1 % for Kinect v1)."""
 _REALSENSE_Z2 = 0.08 / (640.0 * 0.05)
 _MESSAGE_STEP_M = 0.001
 

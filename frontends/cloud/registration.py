@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ...factors.measurements import CloudFrame
 from ..covariance import larger
+from .noise import SMOOTH_SHARE
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -26,9 +27,7 @@ class RegistrationConfig:
     iterations: int = 12
     """For each."""
     normal_agreement_rad: float = np.deg2rad(35.0)
-    smooth_share: float = 0.005
-    """Slowly varying depth error across the image, as a part of the depth: lens and disparity distortion that factory
-    calibration leaves (Herrera, Kannala, Heikkila 2012, find up to 1 % for Kinect v1)."""
+    smooth_share: float = SMOOTH_SHARE
     weakest_sigma_m: float = 1.0
     """Directions that the geometry leaves free get this sigma (and in rad): no information, finite numbers."""
 

@@ -35,6 +35,10 @@ _STEP_PX = 1.0
 _CAUTIOUS_AFTER, _CAUTION = 3, 0.6
 """From that step on only a part of each is taken, which ends the swinging to and fro that outlying pixels can cause."""
 _BLUR_STEP_PX2 = 2.0
+_TONE, _LIGHT, _UNKNOWNS = 11, 12, 22
+"""Places among the unknowns: eight corner coordinates, three of the blur, the tone, ten of the light."""
+_TONE_RANGE = (-0.75, 3.0)
+"""More bent than any camera; the same either way."""
 _COARSE_PX, _FINE_PX = 0.12, 0.012
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
 _COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
@@ -98,11 +102,12 @@ def fit_patterns(
     few = Choice(np.full(m, _COARSE_REACH_PX), _COARSE_LATTICE, _FEW_PIXELS)
     pixels = choose_pixels(image, positions, windows, corners, patterns, few)
     blur = np.tile([blur_px**2, blur_px**2, 0.0], (m, 1))
-    state, _ = _descend(_State(corners - pixels.origin[:, None], blur, None), pixels, D, lines, steps, True)
+    start = _State(corners - pixels.origin[:, None], blur, np.zeros(m), None)
+    state, _ = _descend(start, pixels, D, lines, steps, True)
     coarse = state.corners + pixels.origin[:, None]
     reach = _REACH_PX + _REACH_BLURS * np.sqrt(state.blur[:, :2].max(1))
     pixels = choose_pixels(image, positions, windows, coarse, patterns, Choice(reach, _LATTICE, _MAX_PIXELS))
-    state = _State(coarse - pixels.origin[:, None], state.blur, state.light)
+    state = _State(coarse - pixels.origin[:, None], state.blur, state.tone, state.light)
     state, solved = _descend(state, pixels, D, lines, steps, False)
     return _summary(state, solved, pixels)
 
@@ -113,13 +118,15 @@ class _State:
     """Relative to `Pixels.origin`."""
     blur: Float
     """Shape (m, 3): variances along x and y, and covariance, px^2."""
+    tone: Float
+    """Shape (m,), bend of the response between black and white, see `_solve`."""
     light: Float | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
     step: Float
-    """Change of the eight corner coordinates and the three of the blur, and ten new light values, shape (m, 21)."""
+    """Change of the eight corner coordinates, the three of the blur and the tone, and ten new light values."""
     inverse: Float
     residual: Single
     """After the step."""
@@ -132,11 +139,11 @@ def _descend(
 ) -> tuple[_State, _Solved]:
     """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for."""
     m, n = pixels.value.shape
-    corners, blur = state.corners.copy(), state.blur.copy()
+    corners, blur, tone = state.corners.copy(), state.blur.copy(), state.tone.copy()
     light = np.zeros((m, 10)) if state.light is None else state.light.copy()
     solved = _Solved(
-        np.zeros((m, 21)),
-        np.zeros((m, 21, 21)),
+        np.zeros((m, _UNKNOWNS)),
+        np.zeros((m, _UNKNOWNS, _UNKNOWNS)),
         np.zeros((m, n), np.float32),
         np.zeros((m, n), np.float32),
         np.zeros((m, n, 8), np.float32),
@@ -145,45 +152,56 @@ def _descend(
     active = np.arange(m)
     for count in range(steps):
         lit = None if count == 0 and state.light is None else light[active]
-        one = _solve(_State(corners[active], blur[active], lit), pixels.of(active), D[active], lines, forgiven)
+        now = _State(corners[active], blur[active], tone[active], lit)
+        one = _solve(now, pixels.of(active), D[active], lines, forgiven, coarse)
         largest = np.abs(one.step[:, :8]).max(1)
         shrink = np.minimum(1.0 if count < _CAUTIOUS_AFTER else _CAUTION, _STEP_PX / np.maximum(largest, 1e-9))
         corners[active] += (one.step[:, :8] * shrink[:, None]).reshape(-1, 4, 2)
         blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
-        light[active] = one.step[:, 11:]
+        tone[active] = np.clip(tone[active] + one.step[:, _TONE], *_TONE_RANGE)
+        light[active] = one.step[:, _LIGHT:]
         for name in ("step", "inverse", "residual", "weight", "jacobian"):
             getattr(solved, name)[active] = getattr(one, name)
         active = active[largest > (_COARSE_PX if coarse else _FINE_PX)]
         if not len(active):
             break
-    return _State(corners, blur, light), solved
+    return _State(corners, blur, tone, light), solved
 
 
-def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px: float) -> _Solved:
-    """One Gauss-Newton step of corners and blur, with new light, outlying pixels softened.
+def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px: float, tone_fixed: bool) -> _Solved:
+    """One Gauss-Newton step of corners, blur and tone, with new light, outlying pixels softened.
+
+    The camera's response bends what lies between black and white, T -> (1 + tone) T / (1 + tone T): a gamma of 2.2
+    does so by about 1. That shifts every edge towards the black side, as spread ink shifts it towards the white one,
+    and makes the marker smaller; edges inside the pattern, which look both ways, tell it from the marker's size.
 
     The very first step (no light yet) finds the light beforehand and softens nothing: everything is off then.
     """
     H = homography(state.corners)
     model = pattern_model(H, pixels.xy, state.blur, D, lines)
-    columns = np.empty((*model.T.shape, 21), np.float32)
+    tone = state.tone.astype(np.float32)[:, None]
+    over = 1.0 / (1.0 + tone * model.T)
+    response = (1.0 + tone) * model.T * over
+    columns = np.empty((*model.T.shape, _UNKNOWNS), np.float32)
     u, v = model.a - 0.5, model.b - 0.5
-    for k, column in enumerate((1.0, model.T, u, v, model.T * u, model.T * v)):
-        columns[..., 11 + k] = column
-    columns[..., 17:] = model.surround
+    for k, column in enumerate((1.0, response, u, v, response * u, response * v)):
+        columns[..., _LIGHT + k] = column
+    columns[..., _LIGHT + 6 :] = model.surround
     light, weight = state.light, pixels.weight
     if light is None:
-        light = _least_squares(columns[..., 11:], pixels.value, weight)[0]
-    residual = pixels.value - _times(columns[..., 11:], light)
+        light = _least_squares(columns[..., _LIGHT:], pixels.value, weight)[0]
+    residual = pixels.value - _times(columns[..., _LIGHT:], light)
     gain = _times(np.stack([np.ones_like(u), u, v], -1), light[:, [1, 4, 5]])
+    columns[..., _TONE] = 0.0 if tone_fixed else gain * model.T * (1.0 - model.T) * over**2
+    gain = gain * (1.0 + tone) * over**2
     columns[..., :8] = _by_corners(H, model, pixels.xy, gain)
-    columns[..., 8:11] = gain[..., None] * model.by_blur
+    columns[..., 8:_TONE] = gain[..., None] * model.by_blur
     if state.light is not None:
         slope = gain * np.sqrt(np.einsum("mni,mni->mn", model.gradient, model.gradient))
         weight = weight * _softened(residual, _robust_scale(residual, weight), forgiven_px * slope)
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
-    step[:, 11:] += light
+    step[:, _LIGHT:] += light
     return _Solved(step, inverse, after, weight, columns[..., :8])
 
 
@@ -247,8 +265,8 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
 
 
 def _summary(state: _State, solved: _Solved, pixels: Pixels) -> PatternFit:
-    weight, light = solved.weight, solved.step[:, 11:]
-    freedom = np.maximum(weight.sum(1) - 21.0, 1.0)
+    weight, light = solved.weight, solved.step[:, _LIGHT:]
+    freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
     factor = _hang_together(solved, pixels, weight)
     last_step = np.abs(solved.step[:, :8]).max(1)

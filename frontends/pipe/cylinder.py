@@ -34,6 +34,8 @@ class CylinderConfig:
     """Radii of the halves may differ by this part, beyond their sigmas."""
     split_axis_rad: float = np.deg2rad(6.0)
     """Axes of repeated fits may differ by so much, beyond their sigmas."""
+    check_halves: bool = True
+    """Do halves of the points show the same cylinder? Not asked where a further fit follows that asks."""
     seed: int = 0
 
 
@@ -72,6 +74,7 @@ def fit_cylinder(
     radius_prior_m: tuple[float, float] | None = None,
     config: CylinderConfig | None = None,
     stamp_ns: int = 0,
+    start: Axis | None = None,
 ) -> CylinderFit | Rejection:
     """Fits a cylinder to points of its surface, seen from outside or inside, among others.
 
@@ -82,6 +85,7 @@ def fit_cylinder(
         radius_prior_m: Radius and its standard deviation, where the nominal diameter is known.
         config: Limits.
         stamp_ns: Time, for a rejection's record.
+        start: The cylinder to within a few sigma, where it is known: no other one is looked for.
 
     Returns:
         The fit, or a rejection: too few points, no consensus, or halves and repetitions that disagree (bowls, cones,
@@ -93,15 +97,15 @@ def fit_cylinder(
     kept = spread_evenly(points, config.points) if len(points) > config.points else np.arange(len(points))
     used, noise = points[kept], sigma[kept]
     sample = np.random.default_rng(config.seed).permutation(len(used))[:_SAMPLE]
-    _, normals, _ = local_planes(used, used[sample], int(np.clip(len(used) // 60, 12, 40)))
-    starts = candidates(used[sample], normals, noise[sample], config.seed, seed_axis, radius_prior_m,
-                        (config.smallest_radius_m, config.largest_radius_m))  # fmt: skip
-    thin = sample[:_THIN]
-    fits = [
-        f for f in (_Fit.robust(used[thin], noise[thin], s, radius_prior_m, config) for s in starts) if f is not None
-    ]
-    chosen = max(fits, key=lambda f: f.score, default=None)
-    best = None if chosen is None else _Fit.robust(used, noise, chosen.axis, radius_prior_m, config)
+    if start is None:
+        _, normals, _ = local_planes(used, used[sample], int(np.clip(len(used) // 60, 12, 40)))
+        starts = candidates(used[sample], normals, noise[sample], config.seed, seed_axis, radius_prior_m,
+                            (config.smallest_radius_m, config.largest_radius_m))  # fmt: skip
+        thin = sample[:_THIN]
+        fits = [_Fit.robust(used[thin], noise[thin], s, radius_prior_m, config) for s in starts]
+        chosen = max((f for f in fits if f is not None), key=lambda f: f.score, default=None)
+        start = None if chosen is None else chosen.axis
+    best = None if start is None else _Fit.robust(used, noise, start, radius_prior_m, config)
     if best is None:
         return _refuse(stamp_ns, "inlying share of the points", 0.0, config.inlier_share)
     share = float(best.inlier.mean())
@@ -109,7 +113,7 @@ def fit_cylinder(
         return _refuse(stamp_ns, "inlying share of the points", share, config.inlier_share)
     inside = np.nonzero(best.inlier)[0]
     inside = inside[:: max(1, len(inside) // (2 * _THIN))]
-    split = _halves(used[inside], noise[inside], best, config, radius_prior_m)
+    split = _halves(used[inside], noise[inside], best, config, radius_prior_m) if config.check_halves else 1.0
     if isinstance(split, tuple):
         return _refuse(stamp_ns, *split)
     best = replace(best, covariance=best.covariance * split, independent=best.independent / split)

@@ -6,7 +6,7 @@ on, 2004, section 3.2; the projection against mean and template is the forward a
 Psarakis 2008 turned round).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -23,6 +23,8 @@ _CONVERGED_PX = 0.01
 """A patch that still moves more than this after the last step is given up: those that creep are the bad ones."""
 _LONGEST_STEP_PX = 1.5
 _LARGEST_BEND = 0.4
+_DONE = 0.4
+"""Share of patches that have converged at which the rest goes on alone."""
 
 
 @dataclass(slots=True)
@@ -31,8 +33,10 @@ class Patches:
 
     values: Float32
     """Shape (n, m), normalised."""
-    steps: Float32
-    """Shape (n, k, m), k = 2 or 6: shift in the reference's pixels per normalised difference."""
+    gradient: Float32
+    """Shape (n, 2, m), weighted: derivative of the normalised values by the shift, times the samples' weights."""
+    inverse: Float
+    """Shape (n, k, k), of the normal equations; k = 2 (shift) or 6 (shift and linear part)."""
     prior: Float
     """Shape (n, k, k): share of the step that pulls a bent warp back to the given one."""
     inverse_hessian: Float
@@ -40,29 +44,19 @@ class Patches:
     contrast: Float
     """Shape (n,), standard deviation of the patch in grey values."""
 
+    def __len__(self) -> int:
+        return len(self.values)
+
     def take(self, index: NDArray[np.intp] | Bool) -> "Patches":
         """The patches at the given indices or of the given mask."""
-        return Patches(
-            self.values[index], self.steps[index], self.prior[index], self.inverse_hessian[index], self.contrast[index]
-        )
+        return Patches(*(getattr(self, name)[index] for name in _ARRAYS))
 
     def append(self, other: "Patches") -> "Patches":
         """These patches followed by others."""
-        return Patches(
-            np.concatenate((self.values, other.values)),
-            np.concatenate((self.steps, other.steps)),
-            np.concatenate((self.prior, other.prior)),
-            np.concatenate((self.inverse_hessian, other.inverse_hessian)),
-            np.concatenate((self.contrast, other.contrast)),
-        )
+        return Patches(*(np.concatenate((getattr(self, name), getattr(other, name))) for name in _ARRAYS))
 
-    def put(self, mask: Bool, other: "Patches") -> None:
-        """Replaces the patches of `mask` (n,) by others."""
-        self.values[mask] = other.values
-        self.steps[mask] = other.steps
-        self.prior[mask] = other.prior
-        self.inverse_hessian[mask] = other.inverse_hessian
-        self.contrast[mask] = other.contrast
+
+_ARRAYS = tuple(field.name for field in fields(Patches))
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +71,10 @@ class Alignment:
     """Shape (n, 2, 2): of `px`, from the patch's structure and the residual, px^2, not yet calibrated."""
     converged: Bool
     """Shape (n,)."""
+
+    def take(self, index: NDArray[np.intp] | Bool) -> "Alignment":
+        """Those at the given indices or of the given mask."""
+        return Alignment(self.px[index], self.correlation[index], self.covariance[index], self.converged[index])
 
 
 class PatchGrid:
@@ -97,23 +95,35 @@ class PatchGrid:
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Shape (m,). Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
         self._stiffness = float((self.weights**2).sum()) / bend_sigma**2 if self.affine else 0.0
-        self._shifts = np.ascontiguousarray(self.offsets.T, dtype=np.float32)
+        self._basis = np.concatenate((np.ones((1, len(self.offsets))), self.offsets.T)).astype(np.float32)
+        """Shape (3, m): one, and the offsets in u and v."""
+        self._across = np.ascontiguousarray(self._basis[: 3 if self.affine else 1].T)
 
     def sample(self, image: Float32, px: Float, linear: Float | None = None) -> Float32:
         """Grey values (n, m) at `px + linear @ offset`; `linear` (n, 2, 2) or None for the identity."""
-        shifts = self._shifts[None] if linear is None else linear.astype(np.float32) @ self._shifts
-        start = np.where(np.isfinite(px), px, -10.0).astype(np.float32)
-        u = start[:, 0, None] + shifts[:, 0]
-        v = start[:, 1, None] + shifts[:, 1]
+        if linear is None:
+            linear = np.broadcast_to(np.eye(2), (len(px), 2, 2))
+        plane = np.concatenate((px[:, :, None], linear), axis=2).astype(np.float32)
+        plane[~np.isfinite(px).all(axis=1)] = -10.0
+        u, v = plane[:, 0] @ self._basis, plane[:, 1] @ self._basis
         return _float32(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def jacobian(self, gradient: Float32) -> Float32:
         """Derivatives (n, k, m) by shift and, where it is estimated, linear part (row by row), from (n, 2, m)."""
         if not self.affine:
             return gradient
-        u, v = self._shifts
+        u, v = self._basis[1:]
         along_u, along_v = gradient[:, :1], gradient[:, 1:]
         return np.concatenate((gradient, along_u * u, along_u * v, along_v * u, along_v * v), axis=1)
+
+    def moment(self, weighted_gradient: Float32, difference: Float32) -> Float:
+        """`jacobian^T weights difference` (n, k) without forming the Jacobian."""
+        n, m = difference.shape
+        product = (weighted_gradient * difference[:, None, :]).reshape(2 * n, m) @ self._across
+        product = product.reshape(n, 2, -1).astype(np.float64)
+        if not self.affine:
+            return product[:, :, 0]
+        return np.concatenate((product[:, :, 0], product[:, 0, 1:], product[:, 1, 1:]), axis=1)
 
     def prior(self, variance: Float) -> Float:
         """Information (n, k, k) on the linear part, for a noise variance (n,) of normalised samples."""
@@ -133,13 +143,9 @@ def no_patches(grid: PatchGrid) -> Patches:
     """No patch at all."""
     m = len(grid.weights)
     k = 6 if grid.affine else 2
-    return Patches(
-        np.zeros((0, m), np.float32),
-        np.zeros((0, k, m), np.float32),
-        np.zeros((0, k, k)),
-        np.zeros((0, 2, 2)),
-        np.zeros(0),
-    )
+    square = np.zeros((0, k, k))
+    values, gradient = np.zeros((0, m), np.float32), np.zeros((0, 2, m), np.float32)
+    return Patches(values, gradient, square, square, np.zeros((0, 2, 2)), np.zeros(0))
 
 
 def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
@@ -163,12 +169,13 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0
     jacobian = grid.jacobian(gradient)
     weighted = jacobian * grid.weights
     hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
-    prior = grid.prior(variance / deviation.astype(np.float64) ** 2)
+    variances = deviation.astype(np.float64) ** 2
+    prior = grid.prior(variance / variances)
     inverse = np.linalg.inv(hessian + prior + 1e-9 * np.eye(hessian.shape[1]))
-    steps = inverse.astype(np.float32) @ weighted
-    spread = (steps[:, :2] @ steps[:, :2].transpose(0, 2, 1)).astype(np.float64)
-    spread /= (deviation.astype(np.float64) ** 2)[:, None, None]
-    return Patches(values, steps, inverse @ prior, spread, deviation.astype(np.float64))
+    squared = (weighted @ weighted.transpose(0, 2, 1)).astype(np.float64)
+    spread = (inverse @ squared @ inverse)[:, :2, :2] / variances[:, None, None]
+    gradient *= grid.weights
+    return Patches(values, gradient, inverse, inverse @ prior, spread, deviation.astype(np.float64))
 
 
 def align(
@@ -193,38 +200,64 @@ def align(
     """
     px = guess.copy()
     n = len(px)
-    if n == 0:
-        return Alignment(px, np.zeros(0), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
-    size = patches.steps.shape[1]
-    bend = np.zeros((n, size))
-    active = np.ones(n, dtype=bool)
     difference = np.zeros_like(patches.values)
-    warp = np.array(linear)
+    converged = np.zeros(n, dtype=bool)
+    index = np.flatnonzero(np.isfinite(guess).all(axis=1))
+    now = _Descent(patches, px, linear, grid) if len(index) == n else _Descent(patches, px, linear, grid).take(index)
     for _ in range(iterations):
-        # A slice where all are active: copies of all steps would cost more than the steps themselves.
-        index = slice(None) if active.all() else np.flatnonzero(active)
-        values, _ = grid.normalise(grid.sample(image, px[index], warp[index]))
-        difference[index] = values - patches.values[index]
-        move = (patches.steps[index] @ difference[index][:, :, None])[:, :, 0].astype(np.float64)
-        if grid.affine:
-            move += (patches.prior[index] @ bend[index][:, :, None])[:, :, 0]
-        length = np.linalg.norm(move[:, :2], axis=1)
-        move *= np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-9))[:, None]
-        if grid.affine:
-            bend[index, 2:] = np.clip(bend[index, 2:] - move[:, 2:], -_LARGEST_BEND, _LARGEST_BEND)
-            warp[index] = linear[index] @ (np.eye(2) + bend[index, 2:].reshape(-1, 2, 2))
-        px[index] -= (warp[index] @ move[:, :2, None])[:, :, 0]
-        active[index] = length > _CONVERGED_PX
-        if not active.any():
+        if len(index) == 0:
             break
+        difference[index] = now.step(image)
+        px[index], converged[index] = now.px, now.still
+        # Those that are done go on with the rest until they are many: copies cost more than steps.
+        if now.still.mean() > _DONE:
+            index = index[~now.still]
+            now = now.take(~now.still)
     mean_square = (difference**2) @ grid.weights
     visible = inside(px, image.shape, 2.0)
     correlation = np.where(visible, 1.0 - 0.5 * mean_square, -1.0)
     raw_variance = mean_square * patches.contrast**2
     covariance = raw_variance[:, None, None] * (linear @ patches.inverse_hessian @ linear.transpose(0, 2, 1))
     moved = np.linalg.norm(px - guess, axis=1)
-    converged = visible & ~active & (moved < reach_px)
+    with np.errstate(invalid="ignore"):
+        converged &= visible & (moved < reach_px)
     return Alignment(px, correlation, covariance.astype(np.float64), converged)
+
+
+class _Descent:
+    """Gauss-Newton on n patches at once."""
+
+    def __init__(self, patches: Patches, px: Float, linear: Float, grid: PatchGrid) -> None:
+        self._patches, self._linear, self._grid = patches, linear, grid
+        self.px = px
+        self._bend = np.zeros(patches.inverse.shape[:2])
+        self._warp = linear
+        self.still = np.zeros(len(px), dtype=bool)
+        """Which moved less than `_CONVERGED_PX` in the last step."""
+
+    def take(self, chosen: NDArray[np.intp] | Bool) -> "_Descent":
+        """Goes on with some of them."""
+        part = _Descent(self._patches.take(chosen), self.px[chosen], self._linear[chosen], self._grid)
+        part._bend, part._warp = self._bend[chosen], self._warp[chosen]
+        return part
+
+    def step(self, image: Float32) -> Float32:
+        """Moves all; the normalised differences (n, m) from before the step."""
+        patches, grid = self._patches, self._grid
+        difference = grid.normalise(grid.sample(image, self.px, self._warp))[0]
+        difference -= patches.values
+        moment = grid.moment(patches.gradient, difference)
+        move = (patches.inverse @ moment[:, :, None])[:, :, 0]
+        if grid.affine:
+            move += (patches.prior @ self._bend[:, :, None])[:, :, 0]
+        length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2)
+        move *= np.minimum(1.0, _LONGEST_STEP_PX / np.maximum(length, 1e-9))[:, None]
+        if grid.affine:
+            self._bend[:, 2:] = np.clip(self._bend[:, 2:] - move[:, 2:], -_LARGEST_BEND, _LARGEST_BEND)
+            self._warp = self._linear @ (np.eye(2) + self._bend[:, 2:].reshape(-1, 2, 2))
+        self.px = self.px - (self._warp @ move[:, :2, None])[:, :, 0]
+        self.still = length <= _CONVERGED_PX
+        return difference
 
 
 def _float32(image: object) -> Float32:

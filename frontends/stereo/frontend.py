@@ -282,7 +282,7 @@ class StereoFrontEnd:
             settings.max_tracks - len(tracks),
             self._spacing,
             settings.patch_radius_px + 2,
-            view.pair.noise,
+            view.noise,
         )
         new, seen = self._observer.begin(view, corners, self._next_id, self._chain_T_keyframe)
         self._next_id += len(new)

@@ -57,12 +57,13 @@ def smooth(image: Image, sigma_px: float) -> Float32:
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px), dtype=np.float32)
 
 
-def noise_sigma(image: Image) -> float:
+def noise_sigma(image: Image, gain: float = 1.0) -> float:
     """Robust standard deviation of the pixel noise, in grey values.
 
     Median of the absolute Laplacian difference (Immerkaer, Fast noise variance estimation, 1996), which texture
-    raises; the median keeps to the smooth half of the image. At least the rounding noise.
+    raises; the median keeps to the smooth half of the image. At least the rounding noise, times the gain that the
+    values have been stretched by.
     """
     kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
     response = np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])
-    return max(float(np.median(response)) / (0.6745 * 6.0), 0.3)
+    return max(float(np.median(response)) / (0.6745 * 6.0), 0.3 * gain)

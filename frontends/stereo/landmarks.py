@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..undistort import distort
-from .alignment import Patches, PatchGrid, align, make_patches
+from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
 from .images import Float32, smooth
@@ -133,8 +133,8 @@ class LandmarkStore:
         grid: PatchGrid,
         min_correlation: float,
         variance: float,
-    ) -> tuple[Float, Patches, Bool]:
-        """Left raw pixels (n, 2) of the candidates, their fine patches, and which were found.
+    ) -> tuple[Alignment, Patches, Bool]:
+        """Where the candidates are in the left image, their fine patches, and which were found.
 
         A coarse patch, four times the area, brings the start to within a pixel; the fine one decides.
         """
@@ -148,7 +148,7 @@ class LandmarkStore:
         fine = make_patches(tiles, centres, grid, variance)
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
         second = align(smoothed, fine, start, warp, grid, 10)
-        return second.px, fine, second.converged & (second.correlation > min_correlation)
+        return second, fine, second.converged & (second.correlation > min_correlation)
 
     def revive(self, rows: NDArray[np.intp], raw_px: Float, ideal_px: Float, patches: Patches, points: Float) -> Tracks:
         """Tracks of landmarks found again, with points (n, 3) in this camera and a covariance to be measured."""

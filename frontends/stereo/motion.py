@@ -13,6 +13,10 @@ Bool = NDArray[np.bool_]
 
 GATE_2, GATE_4 = 11.9, 16.3
 """Chi-square of 2 and 4 degrees of freedom at 0.9973."""
+_MAJORITY = 0.7
+"""Share of points that follow a predicted motion beyond which no other motion can hold more."""
+_STILL = 1e-5
+"""A step whose square in sigmas is smaller ends the refinement."""
 MEDIAN_2, MEDIAN_4 = 1.386, 3.357
 """Medians of chi-square of 2 and 4 degrees of freedom."""
 
@@ -52,7 +56,8 @@ def estimate_motion(
         px: (n, 4), ideal left and right pixels in this frame; the right ones may be NaN.
         px_covariance: (n, 4, 4), px^2.
         predicted: poses (4, 4), `reference_T_this` as it may be; they compete with the consensus search, so that a
-            body that moves by itself has to hold more points than the rest to be followed.
+            body that moves by itself has to hold more points than the rest to be followed. Where most points follow
+            one of them there is no search.
         rig: nominal geometry.
         min_inliers: fewer give None.
     """
@@ -62,11 +67,14 @@ def estimate_motion(
     candidates = list(predicted)
     # The weights hardly depend on the pose: those of one serve until the end.
     information = data.information(candidates[0] if candidates else np.eye(4))
-    consensus = _consensus(points, px[:, :2], rig)
-    if consensus is not None:
-        candidates.append(consensus)
-    start = min(candidates, key=lambda pose: data.cost(pose, information))
-    pose = min((data.refine(start, information), start), key=lambda pose: data.cost(pose, information))
+    pose = None
+    if candidates:
+        pose = data.refine(min(candidates, key=lambda p: data.cost(p, information)), information)
+    if pose is None or data.share(pose, information) < _MAJORITY:
+        consensus = _consensus(points, px[:, :2], rig)
+        candidates += [p for p in (pose, consensus) if p is not None]
+        start = min(candidates, key=lambda p: data.cost(p, information))
+        pose = min((data.refine(start, information), start), key=lambda p: data.cost(p, information))
     chi2 = data.chi2(pose, data.information(pose))
     inliers = chi2 < data.gate * data.excess(chi2)
     if inliers.sum() < min_inliers:
@@ -138,6 +146,10 @@ class _Problem:
         """Truncated squares: what outliers cost is bounded."""
         return float(np.minimum(self.chi2(pose, information) / self.gate, 1.0).sum())
 
+    def share(self, pose: Float, information: Float) -> float:
+        """Share of points within the gate of their own covariance."""
+        return float((self.chi2(pose, information) < self.gate).mean())
+
     def excess(self, chi2: Float) -> float:
         """By how much squared residuals (n,) exceed their covariance, from the median; at least one."""
         return float(np.clip(np.median(chi2 / self.expected), 1.0, 16.0))
@@ -159,7 +171,7 @@ class _Problem:
             moment = weighted.reshape(-1, 6).T @ residual.ravel()
             step = np.asarray(np.linalg.solve(normal, moment), dtype=np.float64)
             pose = pose @ exponential(step)
-            if np.linalg.norm(step[:3]) < 1e-6 and np.linalg.norm(step[3:]) < 1e-6:
+            if step @ moment < _STILL:
                 break
         return pose
 

@@ -28,6 +28,8 @@ class Keyview:
     pair: StereoPair
     left: Float32
     right: Float32
+    noise: float
+    """Standard deviation of the pixel noise, grey values."""
 
 
 class Observer:
@@ -39,11 +41,11 @@ class Observer:
 
     def view(self, pair: StereoPair) -> Keyview:
         """The pair with its smoothed images."""
-        return Keyview(pair, *pair.smooth(self._settings.smoothing_px))
+        return Keyview(pair, *pair.smooth(self._settings.smoothing_px), pair.noise())
 
     def mismatch(self, view: Keyview) -> float:
         """Expected variance between a patch and its reference, in squared grey values."""
-        return self._noise.mismatch(view.pair.noise)
+        return self._noise.mismatch(view.noise)
 
     def accepts(self, alignment: Alignment) -> Bool:
         """Which patches look like their reference."""
@@ -66,17 +68,30 @@ class Observer:
         """
         warps = linear_warps(tracks.patch_points, inverse(chain_T_this) @ tracks.patch_poses, self._rig)
         left = align(view.left, tracks.patches, tracks.raw_px, warps[0], self.grid)
-        left_px, left_covariance = undistort(self._rig.left, left.px, self._noise.aligned(left.covariance))
+        left_px, left_covariance = self._left(left)
         seen = self.accepts(left) & np.isfinite(left_px).all(axis=1)
-        # The left ray is known better than the expected one: keep the expected depth on it.
-        points = rays(left_px, self._rig.left) * depth_m[:, None]
-        start = distort(self._rig.right, project(self._rig.right_points(points), self._rig.right)) + right_offset_px
-        start[~seen] = np.nan
-        right = align(view.right, tracks.patches, start, warps[1], self.grid)
-        right_px, right_covariance = self._right(right)
-        assert left_covariance is not None
         self._noise.learn_mismatch(left, tracks.patches, seen)
+        start = np.where(seen[:, None], self._expected_right(left_px, depth_m) + right_offset_px, np.nan)
+        right_px, right_covariance = self._right(align(view.right, tracks.patches, start, warps[1], self.grid))
         return Sighting(left_px, left_covariance, right_px, right_covariance), left.px, seen
+
+    def complete(self, view: Keyview, tracks: Tracks, chain_T_this: Float, left: Alignment) -> Sighting:
+        """Observations of n tracks whose left patches have been aligned already, with their right matches."""
+        warp = linear_warps(tracks.patch_points, inverse(chain_T_this) @ tracks.patch_poses, self._rig)[1]
+        left_px, left_covariance = self._left(left)
+        start = self._expected_right(left_px, tracks.points[:, 2])
+        right_px, right_covariance = self._right(align(view.right, tracks.patches, start, warp, self.grid))
+        return Sighting(left_px, left_covariance, right_px, right_covariance)
+
+    def _expected_right(self, left_px: Float, depth_m: Float) -> Float:
+        """Right raw pixels (n, 2) at the expected depth on the left ray, which is known well."""
+        points = rays(left_px, self._rig.left) * depth_m[:, None]
+        return distort(self._rig.right, project(self._rig.right_points(points), self._rig.right))
+
+    def _left(self, left: Alignment) -> tuple[Float, Float]:
+        px, covariance = undistort(self._rig.left, left.px, self._noise.aligned(left.covariance))
+        assert covariance is not None
+        return px, covariance
 
     def _right(self, right: Alignment) -> tuple[Float, Float]:
         px, covariance = undistort(self._rig.right, right.px, self._noise.aligned(right.covariance))
@@ -85,14 +100,12 @@ class Observer:
         return px, covariance
 
     def begin(self, view: Keyview, raw_px: Float, first_id: int, chain_T_this: Float) -> tuple[Tracks, Sighting]:
-        """New tracks at corners (n, 2) of the left image, with their right matches."""
+        """New tracks at those of the corners (n, 2) of the left image that have a right match.
+
+        Without depth a track adds nothing: no motion could be had from it, nor a landmark.
+        """
         settings = self._settings
         ideal = undistort(self._rig.left, raw_px)[0]
-        valid = np.isfinite(ideal).all(axis=1)
-        raw_px, ideal = raw_px[valid], ideal[valid]
-        patches = make_patches(view.left, raw_px, self.grid, self.mismatch(view))
-        ids: Int = np.arange(first_id, first_id + len(raw_px), dtype=np.int64)
-        tracks = new_tracks(ids, raw_px, ideal, patches, crops(view.left, raw_px, CROP_GRID), chain_T_this)
         start = search_right(
             view.pair.left,
             view.pair.right,
@@ -104,9 +117,16 @@ class Observer:
             settings.patch_radius_px,
             settings.min_correlation,
         )
-        identity = np.broadcast_to(np.eye(2), (len(raw_px), 2, 2))
-        right = align(view.right, patches, start, identity, self.grid)
-        return tracks, self._first_sighting(ideal, raw_px, right, patches)
+        matched = np.isfinite(start).all(axis=1) & np.isfinite(ideal).all(axis=1)
+        raw_px, ideal, start = raw_px[matched], ideal[matched], start[matched]
+        patches = make_patches(view.left, raw_px, self.grid, self.mismatch(view))
+        right = align(view.right, patches, start, np.broadcast_to(np.eye(2), (len(start), 2, 2)), self.grid)
+        sighting = self._first_sighting(ideal, raw_px, right, patches)
+        good = np.isfinite(sighting.right_px[:, 0])
+        ids: Int = np.arange(first_id, first_id + int(good.sum()), dtype=np.int64)
+        surroundings = crops(view.left, raw_px[good], CROP_GRID)
+        tracks = new_tracks(ids, raw_px[good], ideal[good], patches.take(good), surroundings, chain_T_this)
+        return tracks, sighting.take(good)
 
     def _first_sighting(self, ideal: Float, raw_px: Float, right: Alignment, patches: Patches) -> Sighting:
         right_px, right_covariance = self._right(right)

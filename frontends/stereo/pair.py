@@ -21,8 +21,12 @@ class StereoPair:
     right: Image
     levels: Float
     """Shape (3,), quantiles of the left image."""
-    noise: float
-    """Standard deviation of the pixel noise, grey values."""
+    gain: float = 1.0
+    """By which the grey values were stretched."""
+
+    def noise(self) -> float:
+        """Standard deviation of the pixel noise, grey values; takes half a millisecond, and keyframes alone need it."""
+        return images.noise_sigma(self.left, self.gain)
 
     def smooth(self, sigma_px: float) -> tuple[Float32, Float32]:
         """Both images as floats, low-passed."""
@@ -38,10 +42,9 @@ def prepare(stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]
     """A pair from camera images (h, w) or (h, w, 3)."""
     grey = (images.to_grey(left), images.to_grey(right))
     levels = images.quantiles(grey[0])
-    noise = images.noise_sigma(grey[0])
     stretch = images.contrast_table(levels)
     if stretch is None:
-        return StereoPair(stamp_ns, *grey, levels, noise)
+        return StereoPair(stamp_ns, *grey, levels)
     table, gain = stretch
     bright = tuple(cv2.LUT(image, table).astype(np.uint8, copy=False) for image in grey)
-    return StereoPair(stamp_ns, bright[0], bright[1], images.quantiles(bright[0]), noise * gain)
+    return StereoPair(stamp_ns, bright[0], bright[1], images.quantiles(bright[0]), gain)

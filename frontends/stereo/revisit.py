@@ -52,7 +52,7 @@ def revisit(
         return nothing
     here = transform(inverse(chain_T_this), store.points[rows])
     candidates = Candidates(rows, here, distort(rig.left, project(here, rig.left)))
-    raw_px, patches, found = store.find_left(
+    left, patches, found = store.find_left(
         view.pair.left,
         view.left,
         candidates,
@@ -62,7 +62,7 @@ def revisit(
         settings.min_correlation,
         observer.mismatch(view),
     )
-    left_px = undistort(rig.left, raw_px)[0]
+    left_px = undistort(rig.left, left.px)[0]
     found &= np.isfinite(left_px).all(axis=1)
     motion = _agreement(here[found], left_px[found], rig) if found.sum() >= _LEAST else None
     if motion is None:
@@ -71,9 +71,10 @@ def revisit(
     chosen = np.flatnonzero(found)[motion.inliers]
     store.missed(np.delete(rows, chosen))
     corrected = transform(inverse(motion.reference_T_this), here[chosen])
-    tracks = store.revive(rows[chosen], raw_px[chosen], left_px[chosen], patches.take(chosen), corrected)
+    tracks = store.revive(rows[chosen], left.px[chosen], left_px[chosen], patches.take(chosen), corrected)
     pose = chain_T_this @ motion.reference_T_this
-    tracks, sighting = _observe(view, store, rows[chosen], tracks, pose, observer, rig, vertical)
+    sighting = observer.complete(view, tracks, pose, left.take(chosen))
+    tracks, sighting = _measured(store, rows[chosen], tracks, sighting, pose, rig, vertical)
     return tracks, sighting, motion.reference_T_this if len(chosen) >= _ENOUGH else np.eye(4)
 
 
@@ -87,20 +88,17 @@ def _agreement(here: Float, left_px: Float, rig: StereoGeometry) -> Motion | Non
     return motion if motion is not None and motion.inliers.mean() > 0.5 else None
 
 
-def _observe(
-    view: Keyview,
+def _measured(
     store: LandmarkStore,
     rows: NDArray[np.intp],
     tracks: Tracks,
+    sighting: Sighting,
     chain_T_this: Float,
-    observer: Observer,
     rig: StereoGeometry,
     vertical: VerticalCorrection,
 ) -> tuple[Tracks, Sighting]:
     """The finds in both images; their points are measured anew, since the old places have drifted."""
-    offset = np.zeros((len(tracks), 2))
-    sighting, tracks.raw_px, seen = observer.observe(view, tracks, chain_T_this, tracks.points[:, 2], offset)
-    good = seen & np.isfinite(sighting.right_px).all(axis=1)
+    good = np.isfinite(sighting.right_px[:, 0])
     store.forget(rows[good])
     tracks, sighting = tracks.take(good), sighting.take(good)
     tracks.keyframe_px = sighting.left_px

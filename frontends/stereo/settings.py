@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class StereoSettings:
     """Defaults suit a 360x240 pair at 20 Hz; lengths in pixels are those of features, not of the image."""
 
-    max_tracks: int = 200
+    max_tracks: int = 160
     """Number of tracks that detection fills up to."""
     min_distance_px: float = 9.0
     """Smallest distance between two features at 360x240; grows with the image's diagonal."""
@@ -40,7 +40,7 @@ class StereoSettings:
     """Smallest standard deviation of the inliers, in the direction of least spread, as a share of the diagonal."""
     min_relocalisation: int = 15
     """Inliers that a remembered place needs to count as found again."""
-    revisits: int = 80
+    revisits: int = 40
     """Number of old landmarks that each keyframe looks for."""
     store_keyframes: int = 400
     """Number of keyframes that are remembered for relocalisation."""

@@ -8,20 +8,20 @@ import numpy as np
 
 from .geometry import Float, StereoGeometry, project
 
-_PRIOR_PX = np.array([3.0, 3.0, 3.0, 3.0])
-"""Standard deviations of the four terms, each over half the image: what tolerances of a rig can do."""
+_PRIOR_PX = np.array([3.0, 3.0, 3.0, 3.0, 3.0])
+"""Standard deviations of the five terms, each over half the image: what tolerances of a rig can do."""
 _FORGETTING = 0.98
 
 
 class VerticalCorrection:
-    """Offset of right matches across the epipolar line, linear in the place and the disparity."""
+    """Offset of right matches across the epipolar line: linear in place and disparity, and the keystone of a toe-in."""
 
     def __init__(self, rig: StereoGeometry) -> None:
         self._rig = rig
         self._prior = np.diag(1.0 / _PRIOR_PX**2)
-        self._normal = np.zeros((4, 4))
-        self._moment = np.zeros(4)
-        self._terms = np.zeros(4)
+        self._normal = np.zeros((5, 5))
+        self._moment = np.zeros(5)
+        self._terms = np.zeros(5)
 
     def residual(self, left_px: Float, right_px: Float) -> Float:
         """Vertical residuals (n,) of stereo matches after correction, in pixels; NaN without a match."""
@@ -53,8 +53,9 @@ class VerticalCorrection:
 
     def _basis(self, left_px: Float, right_px: Float) -> Float:
         half = 0.5 * self._rig.left.width
-        basis = np.ones((len(left_px), 4))
+        basis = np.ones((len(left_px), 5))
         basis[:, 1] = (right_px[:, 0] - self._rig.right.cx) / half
         basis[:, 2] = (right_px[:, 1] - self._rig.right.cy) / half
         basis[:, 3] = (left_px[:, 0] - right_px[:, 0]) / half
+        basis[:, 4] = basis[:, 1] * basis[:, 2]
         return np.where(np.isfinite(basis), basis, 0.0)

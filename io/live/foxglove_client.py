@@ -26,7 +26,8 @@ _MAXIMUM_TEXT = 4 << 20
 _OVERHEAD = 64
 _LOOK_S = 0.2
 _CONNECT_S = 5.0
-_TOO_BIG = 1009
+VIOLATIONS = {1002: "malformed", 1007: "malformed", 1009: "oversized"}
+"""Why this side ended a connection, by WebSocket's code: protocol error, no UTF-8, too large."""
 
 
 class FoxgloveClient:
@@ -101,8 +102,8 @@ class FoxgloveClient:
                     backoff.succeeded()
                     self._read(connection)
             except ConnectionClosed as error:
-                if error.sent is not None and error.sent.code == _TOO_BIG:
-                    self._intake.refuse("oversized", None, "a message larger than the limit")
+                if error.sent is not None and not error.rcvd_then_sent and error.sent.code in VIOLATIONS:
+                    self._intake.refuse(VIOLATIONS[error.sent.code], None, str(error))
                 self._status = f"connection lost ({error})"
             except (OSError, InvalidHandshake, InvalidURI, EOFError) as error:
                 self._status = f"cannot connect ({error})"
@@ -132,9 +133,6 @@ class FoxgloveClient:
             try:
                 frame = connection.recv(timeout=_LOOK_S)
             except TimeoutError:
-                continue
-            except UnicodeDecodeError:
-                self._intake.refuse("malformed", None, "a text that is not UTF-8")
                 continue
             if isinstance(frame, str):
                 self._text(connection, frame)

@@ -18,7 +18,7 @@ from websockets.typing import Origin
 
 from .access import Access, AccessError
 from .commands import CommandDesk
-from .foxglove_client import MESSAGE_DATA, SUBPROTOCOLS
+from .foxglove_client import MESSAGE_DATA, SUBPROTOCOLS, VIOLATIONS
 from .foxglove_session import SERVICES, Session
 from .foxglove_views import View, description, image_views, views_of
 from .interfaces import LiveImage, LiveUpdate, OnCommand
@@ -27,7 +27,6 @@ from .outbox import Outbox
 from .tally import Tally
 
 MAXIMUM_INBOUND = 64 << 10
-_TOO_BIG = 1009
 _ORIGINS: tuple[Origin | re.Pattern[str] | None, ...] = (
     None,  # programs; browsers always name an origin
     Origin("https://app.foxglove.dev"),
@@ -197,15 +196,18 @@ class FoxgloveServer:
                 if not session.take(frame):
                     await connection.close(1008, "too many commands without the token")
         except ConnectionClosed as error:
-            if error.sent is not None and error.sent.code == _TOO_BIG:
-                self._tally.add("oversized")
-        except UnicodeDecodeError:
-            self._tally.add("malformed")
+            self._count_violation(error)
         finally:
             writing.cancel()
             with self._lock:
                 del self._sessions[connection]
                 self._gone_dropped += session.mailbox.dropped()
+
+    def _count_violation(self, error: ConnectionClosed) -> None:
+        """What a client sent that made this side end the connection."""
+        reason = VIOLATIONS.get(error.sent.code) if error.sent is not None and not error.rcvd_then_sent else None
+        if reason is not None:
+            self._tally.add(reason)
 
     def _greet(self, session: Session) -> None:
         commands = self._access.takes_commands

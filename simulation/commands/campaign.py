@@ -11,8 +11,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from ...estimator.executor import choose_executor
+from ...estimator.validated_range import range_text
 from ...factors.errors import SurecutError
 from ..campaign import open_campaign, run_campaign, write_whole
+from ..campaign_range import validated_range
 from ..campaign_real import real_table, real_text
 from ..campaign_report import label, quantity_text, report_html
 from ..campaign_table import CampaignTable, tabulate, write_tables
@@ -34,15 +36,21 @@ def command(
     leave_out: Annotated[
         bool, typer.Option("--leave-out", help="Estimate again without each family of measurements.")
     ] = False,
+    decisions: Annotated[
+        bool, typer.Option("--decisions", help="Decide random cuts in every run: wrong GOs, and power.")
+    ] = False,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
+    range_file: Annotated[
+        Path | None, typer.Option("--range", help="Write the validated range that reports ask for (YAML).")
+    ] = None,
 ) -> None:
     """Runs a campaign and writes summary.json, summary.csv, quantities.csv and report.html."""
     console = Console()
     if real is not None:
         _real(console, real, output, validation)
         return
-    campaign = open_campaign(scenario, level, leave_out)
+    campaign = open_campaign(scenario, level, leave_out, decisions)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task("runs", total=runs)
@@ -55,7 +63,11 @@ def command(
     _print(console, table)
     console.print(f"{output / 'report.html'}")
     if validation is not None:
-        update_validation(validation, scenario, level, table, stamp())
+        name = f"{scenario}, decisions" if decisions else scenario
+        update_validation(validation, name, level, table, stamp())
+    if range_file is not None:
+        write_whole(range_file, range_text(validated_range(rows, level, stamp())))
+        console.print(f"{range_file}")
     if table.failed == table.runs:
         raise SurecutError(f"no run gave a result; the first says: {next(iter(table.reasons))}")
 

@@ -1,0 +1,59 @@
+"""All factors at an estimate: where they come from, the linear system that they make, and their residuals."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors.noise import robust_scale
+from .correlation import Active, track_inflation
+from .graph import FactorLog
+from .linear import LinearSystem
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Linearised:
+    """One estimate and the factors that count for it."""
+
+    values: gtsam.Values
+    active: Active
+    system: LinearSystem
+    norms: Float
+    """(factors,), norm of each whitened residual, the robust loss undone."""
+    inflation: float = 1.0
+    """Variance of the tracks' errors over what they state."""
+
+
+def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
+    """The factors of a log, without those that are off, at an estimate."""
+    active = [row for row in log.active() if row[0] not in off]
+    graph = gtsam.NonlinearFactorGraph()
+    for _, factor, _ in active:
+        graph.add(factor)
+    system = LinearSystem(graph, values)
+    rejectable = np.array([record.rejectable for _, _, record in active])
+    return Linearised(values, active, system, residual_norms(system, rejectable, robust_sigma))
+
+
+def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_sigma: float) -> Float:
+    """Norms of the whitened residuals, (factors,), from a system whose rejectable factors a Huber loss has softened.
+
+    Beyond its scale k Huber's loss leaves sqrt(k r) of a residual of norm r.
+    """
+    softened = np.sqrt(np.add.reduceat(system.b**2, system.starts[:-1]))
+    scale = np.array([robust_scale(robust_sigma, int(n)) for n in range(1, int(system.rows.max()) + 1)])
+    scale = scale[system.rows - 1]
+    return np.where(rejectable & (softened > scale), softened**2 / scale, softened)
+
+
+def with_correlated_tracks(at: Linearised, family: str) -> Linearised:
+    """The same with covariances that know that the errors of a family's tracks are correlated."""
+    records = [record for _, _, record in at.active]
+    inflation = track_inflation(records, at.system, family)
+    of_tracks = np.array([r.family == family for r in records])
+    at.system.inflation[np.repeat(of_tracks, at.system.rows)] = inflation
+    return Linearised(at.values, at.active, at.system, at.norms, inflation)
