@@ -127,8 +127,8 @@ class Incremental:
                 log.records.append(record)
         with determined():
             prior = marginal(absorbed, self._values, gone)
-        what = f"what earlier keyframes said about {prior.size()} variables"
-        log.factors.append(prior)
+        what = f"what earlier keyframes said about {len(prior.keys)} variables"
+        log.factors.append(prior.factor())
         log.records.append(Record(FAMILY, FAMILY, stamp_ns, what, rejectable=False))
         values = gtsam.Values(self._values)
         for key in gone | without:

@@ -4,7 +4,6 @@ Eliminating variables from the linearised problem (the Schur complement) leaves 
 first order about the linearisation point, which the factor keeps: Leutenegger et al. 2015, section 3.3.
 """
 
-import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
@@ -35,37 +34,27 @@ class GaussianPrior:
     """Linearisation point, of at least these variables."""
 
     def factor(self) -> gtsam.NonlinearFactor:
-        """As one factor of the graph. GTSAM's wrapper makes linear factors of up to three variables; their sum has
-        any number."""
-        starts = np.concatenate([[0], np.cumsum(self.widths)])
-        cut = [slice(int(a), int(b)) for a, b in itertools.pairwise(starts)]
-        H, g, energy = positive_part(self.H, self.g)
-        parts = gtsam.GaussianFactorGraph()
-        for i, (a, key) in enumerate(zip(cut, self.keys, strict=True)):
-            parts.push_back(gtsam.HessianFactor(key, H[a, a], g[a], energy if i == 0 else 0.0))
-            for b, other in zip(cut[i + 1 :], self.keys[i + 1 :], strict=True):
-                if H[a, b].any():
-                    zero_a, zero_b = np.zeros((self.widths[i],) * 2), np.zeros((b.stop - b.start,) * 2)
-                    nothing = np.zeros(len(zero_a)), np.zeros(len(zero_b))
-                    parts.push_back(
-                        gtsam.HessianFactor(key, other, zero_a, H[a, b], nothing[0], zero_b, nothing[1], 0.0)
-                    )
-        return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), only(self.at, self.keys))
+        """As one factor of the graph, with a row for each direction that is informed about."""
+        A, b = square_root(self.H, self.g)
+        stops = np.cumsum(self.widths)
+        terms = [
+            (key, A[:, stop - width : stop]) for key, width, stop in zip(self.keys, self.widths, stops, strict=True)
+        ]
+        # Of GTSAM's wrapped linear factors only the conditional takes any number of variables.
+        many = gtsam.GaussianConditional(terms, 1, b, gtsam.noiseModel.Diagonal.Sigmas(np.ones(len(b))))
+        return gtsam.LinearContainerFactor(gtsam.JacobianFactor(many), only(self.at, self.keys))
 
 
-def positive_part(H: Float, g: Float) -> tuple[Float, Float, float]:
-    """H and g without directions that are rounding, and the constant that makes the least value zero."""
+def square_root(H: Float, g: Float) -> tuple[Float, Float]:
+    """A (m, n) and b (m,) with `A'A = H` and `A'b = g`, without directions that are rounding."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     values, vectors = np.linalg.eigh(0.5 * (H + H.T) * np.outer(scale, scale))
     real = values > NOTHING_REL * values[-1]
-    root = (vectors[:, real] * np.sqrt(values[real])) / scale[:, None]
-    whitened = (vectors[:, real] / np.sqrt(values[real])).T @ (scale * g)
-    return root @ root.T, root @ whitened, float(whitened @ whitened)
+    A = (np.sqrt(values[real]) * vectors[:, real]).T / scale[None, :]
+    return A, (vectors[:, real] / np.sqrt(values[real])).T @ (scale * g)
 
 
-def marginal(
-    factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, gone: Collection[int]
-) -> gtsam.LinearContainerFactor:
+def marginal(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, gone: Collection[int]) -> GaussianPrior:
     """What factors say about the variables that stay.
 
     Args:
@@ -81,7 +70,13 @@ def marginal(
     for key in sorted(set(gone) & touched, key=lambda k: (keys.kind(k) != "l", k)):  # landmarks first: they are sparse
         order.push_back(key)
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(order)
-    return gtsam.LinearContainerFactor(gtsam.HessianFactor(rest), only(values, touched.difference(gone)))
+    joint = gtsam.HessianFactor(rest)
+    order_of_rest = tuple(joint.keys())
+    information = np.asarray(joint.augmentedInformation(), float)
+    widths = tuple(WIDTHS[keys.kind(key)] for key in order_of_rest)
+    return GaussianPrior(
+        order_of_rest, widths, information[:-1, :-1], information[:-1, -1], only(values, order_of_rest)
+    )
 
 
 def gaussian_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stay: Collection[int]) -> GaussianPrior:
@@ -92,11 +87,7 @@ def gaussian_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stay: C
     """
     factors = [graph.at(i) for i in range(graph.size())]
     touched = {key for factor in factors for key in factor.keys()}
-    linear = marginal(factors, values, touched.difference(stay))
-    order = tuple(linear.keys())
-    information = np.asarray(linear.toHessian().augmentedInformation(), float)
-    widths = tuple(WIDTHS[keys.kind(key)] for key in order)
-    return GaussianPrior(order, widths, information[:-1, :-1], information[:-1, -1], only(values, order))
+    return marginal(factors, values, touched.difference(stay))
 
 
 WIDTHS = {
