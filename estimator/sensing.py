@@ -1,6 +1,6 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeGuard
 
@@ -126,18 +126,20 @@ class Sensing:
             fresh,
         )
 
-    def look_back(self, click: Message, pair: PairImages, frame: StereoFrame) -> Sensed:
-        """A click in a frame that has been processed before: what it needs to be a keyframe after all.
+    def look_back(self, clicks: Sequence[Message], pair: PairImages, frame: StereoFrame) -> Sensed:
+        """Clicks in a frame that has been processed before: what it needs to be a keyframe after all.
 
         Raises:
-            LogError: the click cannot be used.
+            LogError: a click cannot be used.
         """
-        pick = self._pick(click)
-        depth = self.sensors.depth_under(pick, pair)
+        picks = tuple(self._pick(click) for click in clicks)
         sightings = [] if frame.is_keyframe else self._sightings(frame.stamp_ns, [], pair)
-        depths = {} if depth is None else {pick.point_id: depth}
-        bundle = Bundle(frame.stamp_ns, frame, tuple(sightings), (pick,), depths)
-        return Sensed(bundle, pair=pair, clicked=self._clicked((pick,), pair, []))
+        bundle = Bundle(frame.stamp_ns, frame, tuple(sightings), picks, self._depths(picks, pair))
+        return Sensed(bundle, pair=pair, clicked=self._clicked(picks, pair, []))
+
+    def _depths(self, picks: Sequence[Pick], pair: PairImages) -> dict[str, tuple[float, float]]:
+        """Surface depth under clicks, where it can be measured."""
+        return {p.point_id: d for p in picks if (d := self.sensors.depth_under(p, pair)) is not None}
 
     def is_calibration(self, item: Item) -> TypeGuard[Message]:
         """Is it a calibration of one of the cameras?"""

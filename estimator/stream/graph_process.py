@@ -12,6 +12,7 @@ from ..sensing import Sensed
 from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
+from .parent import end_with_parent
 from .settings import StreamSettings
 from .wire import Died, Done, LateClick, Order, Ready
 
@@ -33,6 +34,7 @@ class GraphTask:
 
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
+    end_with_parent()
     try:
         loop = _started(task, out, task.prior)
         out.put(Ready("graph"))

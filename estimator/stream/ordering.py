@@ -25,6 +25,9 @@ RHYTHM = 20
 """Moments whose spacing is the rhythm."""
 STRAY_NS = 5_000_000_000
 """A stamp that departs by more from what stamp less receipt was is not believed."""
+CLICKS_NS = 20_000_000
+"""Clicks in a picture that has passed wait so long, by receipt, for others in the same picture."""
+FOREVER = 1 << 62
 JUMPED = 10
 """So many strays in a row that agree are a clock that was set, not errors."""
 
@@ -33,6 +36,9 @@ JUMPED = 10
 class _Moment:
     stamp_ns: int
     arrived_ns: int
+    """Of its first part, by receipt."""
+    changed_ns: int
+    """Of its last part."""
     parts: dict[str, Message] = field(default_factory=dict)
 
 
@@ -49,7 +55,8 @@ class LiveOrder:
         self._mobile = {self._left, self._right, *(topic for topic in markers if topic)}
         self._window_ns = window_ns
         self._moments: list[_Moment] = []
-        self._picks: list[Message] = []
+        self._picks: list[tuple[Message, int]] = []
+        """Clicks and when they came."""
         self._heard: dict[str, int] = {}
         self._released_ns: int | None = None
         self._steps: deque[int] = deque(maxlen=RHYTHM)
@@ -71,8 +78,8 @@ class LiveOrder:
             self.counts["stamp_outlier"] += 1
             return []
         if isinstance(message.body, PickBody) and message.body.camera != "b_rgb":
-            self._picks.append(message)
-            return [*self._late_picks(), *self.due(now_ns)]
+            self._picks = [*self._picks, (message, now_ns)][-WAITING:]
+            return self.due(now_ns)
         if message.topic not in self._mobile:
             return [[message], *self.due(now_ns)]
         if self._released_ns is not None and message.stamp_ns <= self._released_ns + TOLERANCE_NS:
@@ -84,6 +91,7 @@ class LiveOrder:
             self.counts["repeated"] += 1
         else:
             moment.parts[message.topic] = message
+            moment.changed_ns = now_ns
         return self.due(now_ns)
 
     def due(self, now_ns: int) -> list[list[Item]]:
@@ -91,15 +99,15 @@ class LiveOrder:
         groups: list[list[Item]] = []
         while self._moments and self._ready(self._moments[0], now_ns):
             groups += self._release(self._moments.pop(0))
-        return groups
+        return [*groups, *self._late_picks(now_ns)]
 
     def rest(self) -> list[list[Item]]:
         """Everything that waits: nothing more will come."""
         groups: list[list[Item]] = []
         while self._moments:
             groups += self._release(self._moments.pop(0))
-        left, self._picks = self._picks, []
-        return [*groups, *([pick] for pick in left)]
+        self._released_ns = FOREVER
+        return [*groups, *self._late_picks(FOREVER)]
 
     def _believed(self, stamp_ns: int, now_ns: int) -> bool:
         """Is the stamp near where this stream's clock is? One message from the future would make all others late."""
@@ -127,7 +135,7 @@ class LiveOrder:
         for moment in reversed(self._moments):
             if abs(moment.stamp_ns - stamp_ns) <= TOLERANCE_NS:
                 return moment
-        made = _Moment(stamp_ns, now_ns)
+        made = _Moment(stamp_ns, now_ns, now_ns)
         self._moments.append(made)
         self._moments.sort(key=lambda moment: moment.stamp_ns)
         return made
@@ -140,6 +148,8 @@ class LiveOrder:
             alive |= {self._left, self._right}
         if not alive <= first.parts.keys() or self._released_ns is None:
             return False
+        if now_ns <= first.changed_ns:
+            return False  # what comes at the same time, such as a recorded click, belongs to it
         step = float(np.median(self._steps)) if self._steps else 0.0
         return first.stamp_ns - self._released_ns <= 1.5 * step
 
@@ -160,17 +170,21 @@ class LiveOrder:
         group += [part for part in parts.values() if not isinstance(part.body, ImageBody)]
         if group:
             stamp_ns = group[0].stamp_ns
-            apart = [abs(pick.stamp_ns - stamp_ns) for pick in self._picks]
-            group += [
-                replace(p, stamp_ns=stamp_ns) for p, d in zip(self._picks, apart, strict=True) if d <= TOLERANCE_NS
-            ]
-            self._picks = [p for p, d in zip(self._picks, apart, strict=True) if d > TOLERANCE_NS]
-        return [*([group] if group else []), *self._late_picks()]
+            apart = [abs(pick.stamp_ns - stamp_ns) for pick, _ in self._picks]
+            mine = [pick for (pick, _), d in zip(self._picks, apart, strict=True) if d <= TOLERANCE_NS]
+            self._picks = [waiting for waiting, d in zip(self._picks, apart, strict=True) if d > TOLERANCE_NS]
+            group += [replace(pick, stamp_ns=stamp_ns) for pick in mine]
+        return [group] if group else []
 
-    def _late_picks(self) -> list[list[Item]]:
-        """Clicks in frames that have passed: a person is slower than a camera."""
-        newest = self._released_ns
-        passed = [p.stamp_ns <= 0 or (newest is not None and p.stamp_ns <= newest) for p in self._picks]
-        late = [pick for pick, gone in zip(self._picks, passed, strict=True) if gone]
-        self._picks = [pick for pick, gone in zip(self._picks, passed, strict=True) if not gone]
-        return [[pick] for pick in late]
+    def _late_picks(self, now_ns: int) -> list[list[Item]]:
+        """Clicks in frames that have passed: a person is slower than a camera. Those in one picture go together."""
+        passed: dict[int, list[Item]] = {}
+        waiting = []
+        for pick, came_ns in self._picks:
+            gone = pick.stamp_ns <= 0 or (self._released_ns is not None and pick.stamp_ns <= self._released_ns)
+            if gone and now_ns - came_ns >= CLICKS_NS:
+                passed.setdefault(pick.stamp_ns, []).append(pick)
+            else:
+                waiting.append((pick, came_ns))
+        self._picks = waiting
+        return list(passed.values())

@@ -18,12 +18,14 @@ from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
 from ..sensing import Item, Sensing, images
 from ..sensors import PairImages
+from .parent import end_with_parent
 from .settings import StreamSettings
 from .wire import Died, Frame, Group, LateClick, Order, Ready, Worked
 
 
 def sense(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) -> None:
     """The process. `inbox`, `graph` and `out` are queues between processes."""
+    end_with_parent()
     cv2.setNumThreads(1)
     try:
         loop = SenseLoop(rig, settings, graph, out)
@@ -77,10 +79,10 @@ class SenseLoop:
         problem, outlines, picks = None, {}, 0
         stamp_ns = items[0].stamp_ns
         try:
-            pick = items[0]
-            if len(items) == 1 and isinstance(pick, Message) and _in_the_past(pick):
-                picks = 1
-                self._late(pick)
+            clicks = [item for item in items if isinstance(item, Message) and _on_mobile(item)]
+            if len(clicks) == len(items):
+                picks = len(clicks)
+                self._late(clicks)
             else:
                 outlines = self._present(items)
         except SurecutError as error:
@@ -112,15 +114,15 @@ class SenseLoop:
         while self._recent and next(iter(self._recent)) < frame.stamp_ns - self._settings.recent_ns:
             self._recent.popitem(last=False)
 
-    def _late(self, message: Message) -> None:
-        """A click in a frame that has passed: with its pictures, so that the graph may make it a keyframe."""
-        stamp_ns = message.stamp_ns if message.stamp_ns > 0 else self._newest_ns
+    def _late(self, clicks: list[Message]) -> None:
+        """Clicks in a frame that has passed: with its pictures, so that the graph may make it a keyframe."""
+        stamp_ns = clicks[0].stamp_ns if clicks[0].stamp_ns > 0 else self._newest_ns
         recent = self._recent.get(self._nearest(stamp_ns))
         if recent is None:
-            self._graph.put(self._sensing.process([message]))
+            self._graph.put(self._sensing.process(list(clicks)))
             return
-        sensed = self._sensing.look_back(replace(message, stamp_ns=recent.frame.stamp_ns), recent.pair, recent.frame)
-        self._graph.put(LateClick(sensed))
+        own = [replace(click, stamp_ns=recent.frame.stamp_ns) for click in clicks]
+        self._graph.put(LateClick(self._sensing.look_back(own, recent.pair, recent.frame)))
 
     def _nearest(self, stamp_ns: int) -> int:
         """Stamp of the remembered frame within a millisecond."""
@@ -136,5 +138,5 @@ class SenseLoop:
         return {camera: tuple(outlines) for camera, outlines in found.items()}
 
 
-def _in_the_past(message: Message) -> bool:
+def _on_mobile(message: Message) -> bool:
     return isinstance(message.body, PickBody) and message.body.camera != "b_rgb"
