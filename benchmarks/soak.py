@@ -71,7 +71,7 @@ def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
         if not first:
             first.append(stream.stamp_ns())
         seconds = (stream.stamp_ns() - first[0]) * 1e-9
-        if seconds - last[0] >= 10.0 or not samples:
+        if seconds - last[0] >= 2.0 or not samples:
             last[0] = seconds
             samples.append(looked(stream, first[0]))
         if seconds >= 60 * minutes or time.monotonic() - began > wall_s:
@@ -91,13 +91,16 @@ def table(samples: list[Sample]) -> bool:
     for tenth in range(10):
         part = [s for s in samples if tenth * end / 10 <= s.stamp_s <= (tenth + 1) * end / 10]
         if len(part) < 2:
-            continue
+            continue  # less than a look at a time
         frames = max(part[-1].frames - part[0].frames, 1)
         cost = [1e3 * (b - a) / frames for a, b in zip(part[0].cpu_s, part[-1].cpu_s, strict=True)]
         costs.append(sum(cost))
         memory = " ".join(f"{m:.0f}" for m in part[-1].rss_mb)
         parts = f"{cost[0]:9.1f} {cost[1]:11.1f} {cost[2]:6.1f}"
         print(f"{part[-1].stamp_s / 60:9.1f} {sum(cost):18.1f} {parts}   {memory}")
+    if not costs:
+        print("too short to tell")
+        return False
     warm = next((s for s in samples if s.stamp_s >= WARM_UP_S), samples[-1])
     grown = sum(samples[-1].rss_mb) / sum(warm.rss_mb)
     print(f"cost of the last tenth over the first: {costs[-1] / costs[0]:.2f} (limit {COST})")

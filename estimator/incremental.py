@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..factors.errors import ObservabilityError
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, marginal
+from .marginal import FAMILY, gaussian_of, marginal
 from .observability import determined
 
 Float = NDArray[np.float64]
@@ -36,7 +36,7 @@ RELINEARIZE_EVERY = 10
 """Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
 of a batch solution; `settle` makes up for what is left at the end."""
 
-SETTLE_ROUNDS = 3
+SETTLE_ROUNDS = 2
 """Relinearisations before variables leave: what they say is frozen where it is taken."""
 
 
@@ -158,8 +158,12 @@ class Incremental:
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
         """Joint covariance of some variables, in the order of `keys`."""
-        joint = self._isam.jointMarginalCovariance(list(keys))
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        joint = gaussian_of(self.log.graph(), self._values, keys)
+        covariance = np.linalg.inv(joint.H)
+        ends = np.cumsum(joint.widths)
+        columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
+        chosen = np.concatenate([columns[key] for key in keys])
+        return covariance[np.ix_(chosen, chosen)]
 
 
 def _parameters() -> gtsam.ISAM2Params:

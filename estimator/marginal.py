@@ -65,9 +65,12 @@ def marginal(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, gon
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
-    touched = {key for factor in factors for key in factor.keys()}
+    return _eliminated(graph, values, set(gone).intersection(graph.keyVector()))
+
+
+def _eliminated(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, gone: set[int]) -> GaussianPrior:
     order = gtsam.Ordering()
-    for key in sorted(set(gone) & touched, key=lambda k: (keys.kind(k) != "l", k)):  # landmarks first: they are sparse
+    for key in sorted(gone, key=lambda k: (keys.kind(k) != "l", k)):  # landmarks first: they are sparse
         order.push_back(key)
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(order)
     joint = gtsam.HessianFactor(rest)
@@ -85,9 +88,7 @@ def gaussian_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stay: C
     Args:
         stay: keys; those that no factor touches are left out.
     """
-    factors = [graph.at(i) for i in range(graph.size())]
-    touched = {key for factor in factors for key in factor.keys()}
-    return marginal(factors, values, touched.difference(stay))
+    return _eliminated(graph, values, set(graph.keyVector()).difference(stay))
 
 
 WIDTHS = {

@@ -15,7 +15,7 @@ from ..points_in_base import point_blocks
 from ..result import Consistency
 
 TESTED = ("mount", "known distances", "board geometry", "calibration priors")
-SETTLE_ROUNDS = 3
+SETTLE_ROUNDS = 2
 """Relinearisations before the residuals are judged: those at an old linearisation are not the data's."""
 NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
 

@@ -25,7 +25,7 @@ class StreamSettings:
     """How far back a click may be: pictures of so long are kept."""
     answer_period_ns: int = 400 * MS
     """Points in {b} with covariance at least so often, while measurements come."""
-    audit_period_ns: int = 10 * S
+    audit_period_ns: int = 20 * S
     """Between tests of the model against its own data."""
     checkpoint_period_s: float = 5.0
     """By the computer's clock."""
