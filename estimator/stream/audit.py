@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 
 from ...factors import keys
@@ -15,8 +16,6 @@ from ..points_in_base import point_blocks
 from ..result import Consistency
 
 TESTED = ("mount", "known distances", "board geometry", "calibration priors")
-SETTLE_ROUNDS = 2
-"""Relinearisations before the residuals are judged: those at an old linearisation are not the data's."""
 NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
 
 
@@ -29,11 +28,17 @@ class Audit:
     """By point: factor on its covariance, at least 1."""
 
 
+def relinearised(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    """One Newton step on: residuals at an old linearisation are not the data's. The running estimate stays as it is,
+    so that looking does not change what comes after."""
+    return values.retract(graph.linearize(values).optimize())
+
+
 def audit(engine: Engine) -> Audit:
     """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
     mostly made of them, and cannot be told apart any more."""
-    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
-    values, log = engine.state.values, engine.solver.log
+    log = engine.solver.log
+    values = relinearised(log.graph(), engine.solver.values())
     at = with_correlated_tracks(linearise(log, (), values, engine.rig.gates.robust_sigma), ODOMETRY)
     system = at.system
     earlier = np.array([record.family == FAMILY for _, _, record in at.active])
