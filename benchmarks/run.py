@@ -19,7 +19,8 @@ import cv2
 import gtsam
 import numpy as np
 
-from surecut.estimator.engine import Engine, bundles
+from surecut.estimator.bundle import bundles
+from surecut.estimator.engine import Engine
 from surecut.estimator.linear import LinearSystem
 from surecut.estimator.run import estimate
 from surecut.estimator.surfaces import lay_on_surfaces

@@ -7,7 +7,6 @@ from typing import Self
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, diags
 
 from .linear import LinearSystem
 
@@ -38,7 +37,7 @@ class Rows:
 class Joint:
     """Some variables: the inverse information that weighs measurements, and the covariance of the estimate.
 
-    They are equal as long as the weights are right. Where errors are correlated (`LinearSystem.inflation`) the weights
+    They are equal as long as the weights are right. Where errors are correlated (`LinearSystem.root`) the weights
     stay and the covariance grows.
     """
 
@@ -53,9 +52,8 @@ class Joint:
         """The joint of some variables of the graph as it is."""
         columns, X = _solved(system, keys)
         selected = np.concatenate([np.arange(system.parameters)[system.columns[key]] for key in keys])
-        middle = csr_matrix(system.A.T @ diags(system.inflation) @ system.A)
-        weight = X[selected]
-        return cls(columns, 0.5 * (weight + weight.T), X.T @ (middle @ X))
+        weight, influence = X[selected], system.weigh(system.A @ X)
+        return cls(columns, 0.5 * (weight + weight.T), influence.T @ influence)
 
     def after(self, rows: Rows, blocks: Blocks) -> Float:
         """Covariance of `J x` after further measurements.
@@ -144,7 +142,7 @@ def measured_again(system: LinearSystem, rows: NDArray[np.bool_], times: float, 
     W = np.sqrt(times - 1.0) * system.A[rows].toarray()
     right = np.hstack([J, W.T])
     X = system.solve(right)
-    middle = csr_matrix(system.A.T @ diags(system.inflation) @ system.A)
-    joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, X.T @ (middle @ X))
+    influence = system.weigh(system.A @ X)
+    joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, influence.T @ influence)
     select = np.hstack([np.zeros((len(W), J.shape[1])), np.eye(len(W))])
-    return joint.after(Rows(select, np.diag(system.inflation[rows])), [(0, np.eye(J.shape[1], right.shape[1]))])
+    return joint.after(Rows(select, system.error_covariance(rows)), [(0, np.eye(J.shape[1], right.shape[1]))])

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..factors.measurements import Event
 from .consistency import PriorTest
 from .correlation import Active
 from .depth_pipes import DepthPipes, SeenCylinder
@@ -12,6 +13,10 @@ from .linear import LinearSystem, deviate
 
 Float = NDArray[np.float64]
 
+TOLD_SIGMA = 3.0
+ERROR_SIGMA = 3.9
+"""Beyond it (1 in 10 000 by chance) the contradiction has to be settled before anybody cuts."""
+
 
 def cylinder_tests(pipes: DepthPipes, active: Active, system: LinearSystem, values: gtsam.Values) -> list[PriorTest]:
     """Every pipe in the Kinect's cloud against what everything else says about it, in sigmas.
@@ -19,10 +24,11 @@ def cylinder_tests(pipes: DepthPipes, active: Active, system: LinearSystem, valu
     Also of cylinders that were kept out of the graph: theirs is the disagreement that a user has to know.
     """
     inside = {record.what: position for position, (_, _, record) in enumerate(active)}
-    return [_test(seen, inside.get(seen.what), system, values) for seen in pipes.seen.values()]
+    return [cylinder_test(seen, inside.get(seen.what), system, values) for seen in pipes.seen.values()]
 
 
-def _test(seen: SeenCylinder, position: int | None, system: LinearSystem, values: gtsam.Values) -> PriorTest:
+def cylinder_test(seen: SeenCylinder, position: int | None, system: LinearSystem, values: gtsam.Values) -> PriorTest:
+    """A cylinder against what a system says about it; `position` is its factor's there, None where it has none."""
     record = Record("pipe cylinder", seen.what, seen.sighting.stamp_ns, seen.what)
     linear = seen.factor().linearize(values)
     residual = -linear.jacobian()[1]
@@ -37,3 +43,15 @@ def _test(seen: SeenCylinder, position: int | None, system: LinearSystem, values
     spread = np.eye(len(residual)) + system.covariance(blocks)
     total = float(residual @ np.linalg.solve(spread, residual))
     return PriorTest(record, total, len(residual), deviate(total, len(residual)), residual)
+
+
+def cylinder_event(test: PriorTest) -> Event | None:
+    """What a user has to know of a pipe that the cameras see in different places; None where they agree."""
+    if test.sigma < TOLD_SIGMA:
+        return None
+    text = (
+        f"{test.record.what} lies {test.sigma:.1f} sigma from where the mobile camera, boards and mount put it: the "
+        "mount is wrong, the Kinect or a board has been moved, or it is another pipe"
+    )
+    severity = "error" if test.sigma > ERROR_SIGMA else "warning"
+    return Event(test.record.stamp_ns, "pipe_disagrees", text, severity, {"sigma": test.sigma})

@@ -43,7 +43,7 @@ class BatchSolution:
 
 def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
     """Robust Levenberg-Marquardt; then what is beyond noise is taken out, first by its residual, then by snooping."""
-    first, iterations = _optimise(log.graph(), start)
+    first, iterations = optimum(log.graph(), start)
     off: set[int] = set()
     rejected: list[Rejection] = []
     at = linearise(log, off, first, robust_sigma)
@@ -56,14 +56,15 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            values, more = _optimise(_without(log, off), at.values)
+            values, more = optimum(_without(log, off), at.values)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
     at = with_correlated_tracks(at, ODOMETRY)
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
-def _optimise(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+    """Levenberg-Marquardt from a start near the optimum: the values, and the number of iterations."""
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(1e-6)
     parameters.setAbsoluteErrorTol(1e-4)

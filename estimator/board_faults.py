@@ -226,7 +226,9 @@ def _marker_fault(look: _Look, sheet: Sheet, what: str) -> Fault | None:
     if not shift.determined():
         return None
     value, covariance = shift.solution()
-    total = float(value @ shift.information @ value)
+    # the page factor knows the tolerance of a marker's place; it is one of its turn as well
+    covariance[2, 2] += (board.centre_sigma_m / board.side_m) ** 2
+    total = float(value @ np.linalg.solve(covariance, value))
     off = deviate(total, 3)
     limit = normal_isf(MARKER_FALSE_ALARM / 2)
     length = float(np.linalg.norm(value[:2]))

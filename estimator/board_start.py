@@ -14,6 +14,7 @@ from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Noise, Rig
+from ..frontends.board_fit import corner_covariance
 from ..frontends.board_pose import PoseCandidate, apparent_side, board_pose_candidates
 from .graph import State
 from .sheet import Sheet
@@ -161,8 +162,7 @@ class FirstPose:
             o_T_c = self._state.pose(key)
             if camera != "m_left":
                 o_T_c = o_T_c.compose(self._state.pose(keys.extrinsics(camera)))
-            covariance = np.concatenate([s.covariance_px2 for s in mine])
-            covariance = covariance + self._rig.noise.marker_common_px**2 * np.eye(2)
+            covariance = np.concatenate([corner_covariance(s, self._rig.noise.marker_common_px) for s in mine])
             views.append(
                 _View(
                     self.pinhole(camera).K,

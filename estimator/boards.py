@@ -13,6 +13,7 @@ from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.noise import gaussian, robust
 from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Rig
+from ..frontends.board_fit import corner_covariance
 from ..frontends.board_pose import board_pose_candidates
 from .board_inspection import FAMILY, Inspection
 from .board_moves import Joint, displacement, may_be_the_board, new_place, scaled_pose, still_moving
@@ -20,7 +21,7 @@ from .board_start import FirstPose, Side, inset_sigma_px
 from .graph import Record, State, Update
 from .result import CalibrationEstimate
 from .sheet import Displaced, Knock, PageFactor, Sheet
-from .view_cells import ViewCells
+from .view_cells import ViewCells, added_covariance
 
 Float = NDArray[np.float64]
 
@@ -386,15 +387,19 @@ class Boards:
         return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
-        """A corner's lasting detection error on the page, from its size in this first view."""
+        """A corner's lasting detection error on the page, from its size in this first view.
+
+        None where the pixels were at hand: of the fit to them nothing lasts from place to place but an inset.
+        """
+        if sighting.common_px is not None:
+            return 0.0
         diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
         return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
 
     def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
         """Adds the part of a corner's error that views from the same place share; None where they are plenty.
 
-        Views are counted per cell of viewing position; the n-th view of a cell gets n times the common variance, so
-        that standing still gives no more than one view's worth of it.
+        Views are counted per cell of viewing position; the n-th one of a cell gets what it adds to those before it.
         """
         cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
         if cells.last != keyframe:
@@ -403,7 +408,9 @@ class Boards:
         if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
             self._refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
             return None
-        return sighting.covariance_px2 + np.eye(2) * self._rig.noise.marker_common_px**2 * cells.views
+        given = self._rig.noise.marker_common_px
+        common = given if sighting.common_px is None else sighting.common_px
+        return added_covariance(corner_covariance(sighting, given), common, cells.views)
 
     # Book-keeping ---------------------------------------------------------------------------------------------
 

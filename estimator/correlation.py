@@ -1,54 +1,288 @@
-"""Errors of one track in successive keyframes are alike: how much, from the run's own residuals."""
+"""Errors of one track are alike in successive keyframes and in the two images of one, and a little like those of its
+neighbours: how much, from the residuals.
+
+All views of a track are found with one reference patch; where the patch looks different now, it does so in both images
+and in the next keyframe too. Neighbours are on one surface, seen through one part of the lens. A landmark that is
+fitted to a track takes most of what its errors share with it, so that residuals look smaller and less alike than the
+errors are. So the correlation is not read off the residuals: errors of some kinds are drawn instead and sent through
+the same adjustment, and the mixture is sought whose residuals look like those of the run (estimation of variance
+components; Förstner 1979).
+"""
 
 from collections import defaultdict
+from dataclasses import dataclass
+from itertools import pairwise, product
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.sparse import csr_matrix
 
+from ..factors import keys
 from .graph import Record
 from .linear import LinearSystem
+from .motions import motion_blocks, windows
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Bool = NDArray[np.bool_]
 Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 """Factors with their index in the log and their record."""
 
-FEWEST_VIEWS = 8
+LAGS = 7
+"""Keyframes apart up to which residuals of one track are compared."""
+PERSISTENCE = (0.0, 0.5, 0.8)
+"""Correlation of neighbours in the kinds of error: white, over two keyframes, over five."""
+KINDS = tuple(product(PERSISTENCE, (False, True)))
+"""Persistence, and whether left and right image share the error."""
+DRAWS = 6
+"""Draws per kind: each holds some ten thousand residuals."""
+RANGE = 0.14
+"""Distance over which errors of neighbours are alike, as a share of the image's diagonal."""
+NEAR = (0.0, 0.07, 0.14, 0.28)
+"""Distances of neighbours whose residuals are compared, likewise."""
+MOTIONS = 12
+"""Motions over a second that are looked at."""
 FEWEST_PAIRS = 300
-LARGEST = 4.0
-TAKEN = 0.75
-"""Parameters of a landmark per row of one of its views (two cameras, two rows each)."""
+"""Pairs of residuals, `LAGS` apart, that tell."""
+SEGMENT = 16
+"""Views of a track whose errors are taken to be correlated: longer tracks are several of them."""
+CAMERAS = ("m_left", "m_right")
 
 
-def track_inflation(records: list[Record], system: LinearSystem, family: str) -> float:
-    """Factor by which white-noise variances understate what tracks with correlated errors leave in an estimate.
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """What the errors of a family's tracks are like."""
 
-    For a first-order autoregressive error with lag-one correlation rho a mean over many views has
-    (1 + rho) / (1 - rho) times the variance of the same number of independent ones (Bartlett 1946). rho comes from
-    the whitened residuals of long tracks. A landmark's three parameters, fitted to n views by two cameras, take
-    3 / (4 n) of every residual's variance, which leaves white noise anticorrelated by 0.75 / (n - 0.75) between any
-    two views; that is added back.
+    root: csr_matrix
+    """Shape (rows, rows): times its transpose the covariance of the whitened errors of all factors."""
+    inflation: float
+    """Variance of the mean of a track's errors, on average, over that of white ones of the stated variance."""
 
-    Returns:
-        At least 1; exactly 1 where too few tracks are long enough to tell.
+
+def correlate(active: Active, values: gtsam.Values, system: LinearSystem, family: str) -> Correlation | None:
+    """The errors of a family's tracks; None where too few tracks are long enough to tell.
+
+    What neighbours share is not a matter of one track: it raises all of them by what it does to the camera's motion
+    over a second.
     """
-    tracks: dict[str, list[tuple[int, Float]]] = defaultdict(list)
-    for position, record in enumerate(records):
-        if record.family == family and record.camera is not None:
-            rows = slice(system.starts[position], system.starts[position + 1])
-            tracks[record.what].append((record.stamp_ns, system.b[rows]))
-    products = squares = bias = 0.0
-    pairs = 0
-    for sightings in tracks.values():
-        if len(sightings) < FEWEST_VIEWS:
-            continue
-        residual = np.array([r for _, r in sorted(sightings, key=lambda s: s[0])])
-        count = len(residual) - 1
-        products += float((residual[1:] * residual[:-1]).sum())
-        squares += float((residual**2).sum()) * count / len(residual)
-        bias += TAKEN / (len(residual) - TAKEN) * count
-        pairs += count
-    if pairs < FEWEST_PAIRS or squares <= 0.0:
+    tracks = Tracks(active, family)
+    if len(tracks.track) == 0 or int((tracks.track[LAGS:] == tracks.track[:-LAGS]).sum()) < FEWEST_PAIRS:
+        return None
+    variances = components(tracks, system)
+    own, neighbours = variances[:-1], variances[-1]
+    found = root(tracks, system, own)
+    effect = _design_effect(tracks, values, system, found, neighbours)
+    return Correlation(found * np.sqrt(effect), _inflation(tracks, own * effect))
+
+
+def _design_effect(
+    tracks: "Tracks", values: gtsam.Values, system: LinearSystem, found: csr_matrix, neighbours: Float
+) -> float:
+    """Variance of motions with what neighbours share over that without (Kish 1965, design effect)."""
+    if not neighbours.any():
         return 1.0
-    rho = products / squares + bias / pairs
-    return float(np.clip((1 + rho) / (1 - min(rho, 0.9)), 1.0, LARGEST))
+    pairs = windows(tracks.stamps)
+    pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), MOTIONS)).round().astype(int)]
+    right = [system.selector(motion_blocks(values, tracks.keyframes[a], tracks.keyframes[b])) for a, b in pairs]
+    if not right:
+        return 1.0
+    influence = system.A @ system.solve(np.hstack(right))
+    alone = (np.asarray(found.T @ influence) ** 2).sum(axis=0)
+    own = tracks.gather(system, influence).sum(axis=1)
+    shared = np.zeros_like(alone)
+    for image, kernel in zip(tracks.images, tracks.kernels, strict=True):
+        for axis in range(2):
+            shared += neighbours[axis] * (own[image, axis] * (kernel @ own[image, axis])).sum(axis=0)
+    return 1.0 + float(np.median(shared / alone))
+
+
+def root(tracks: "Tracks", system: LinearSystem, variances: Float) -> csr_matrix:
+    """Cholesky factor of the covariance of all whitened errors: blocks of tracks, one elsewhere.
+
+    Args:
+        tracks: whose errors are correlated.
+        system: tells the rows.
+        variances: shape (kinds, 2), of every kind of error.
+    """
+    segment = tracks.track * (int(tracks.place.max()) // SEGMENT + 1) + tracks.place // SEGMENT
+    starts = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
+    covariance, first = _segment_covariance(variances), tracks.first_rows(system)
+    known: dict[bytes, Float] = {}
+    i, j, data = [], [], []
+    for a, b in zip(starts, np.r_[starts[1:], len(segment)], strict=True):
+        seen = tracks.seen[a:b].ravel()
+        rows = first[a:b].ravel()[seen]
+        if seen.tobytes() not in known:
+            at = np.flatnonzero(seen)
+            own = covariance[:, at[:, None], at]
+            known[seen.tobytes()] = np.asarray(np.linalg.cholesky(own), np.float64)
+        for axis, factor in enumerate(known[seen.tobytes()]):
+            i.append(np.repeat(rows + axis, len(rows)))
+            j.append(np.tile(rows + axis, len(rows)))
+            data.append(factor.ravel())
+    others = np.setdiff1d(np.arange(len(system.b)), np.concatenate(i))
+    entries = np.concatenate([*data, np.ones(len(others))])
+    place = np.concatenate([*i, others]), np.concatenate([*j, others])
+    found = csr_matrix((entries, place), shape=(len(system.b), len(system.b)))
+    found.eliminate_zeros()
+    return found
+
+
+def _segment_covariance(variances: Float) -> Float:
+    """Covariance (2, 2 SEGMENT, 2 SEGMENT) by axis of the errors in successive keyframes, left and right by turns."""
+    place = np.repeat(np.arange(SEGMENT), 2)
+    same = (np.arange(2 * SEGMENT)[:, None] - np.arange(2 * SEGMENT)) % 2 == 0
+    total = np.zeros((2, 2 * SEGMENT, 2 * SEGMENT))
+    for variance, (rho, shared) in zip(variances, KINDS, strict=True):
+        apart = np.abs(place[:, None] - place)
+        kind = np.where(apart == 0, 1.0, rho**apart) * (same | shared)
+        total += variance[:, None, None] * kind
+    return total + 1e-6 * np.eye(2 * SEGMENT)
+
+
+def _inflation(tracks: "Tracks", variances: Float) -> float:
+    """Of the mean over each track's views in both images, on average."""
+    length = np.bincount(tracks.track)
+    factor = np.zeros(len(length))
+    for variance, (rho, shared) in zip(variances, KINDS, strict=True):
+        factor += (2.0 if shared else 1.0) * float(variance.mean()) * mean_factor(rho, length)
+    return max(float((factor * length).sum() / length.sum()), 1.0)
+
+
+def mean_factor(rho: float, count: Int) -> Float:
+    """Variance of the mean of `count` values of an AR(1) process over that of independent ones."""
+    if rho == 0.0:
+        return np.ones(len(count))
+    return (1 + rho) / (1 - rho) - 2 * rho * (1 - rho**count) / (count * (1 - rho) ** 2)
+
+
+def components(tracks: "Tracks", system: LinearSystem) -> Float:
+    """Variance of every kind of error in u and v, in units of what the whitening says; shape (kinds + 1, 2).
+
+    The last one is what neighbours share.
+    """
+    rng = np.random.default_rng(0)
+    seen, counts = tracks.products(tracks.gather(system, system.b[:, None]))
+    expected = []
+    drawn = [tracks.draw(rho, shared, DRAWS, rng) for rho, shared in KINDS]
+    for errors in (*drawn, tracks.draw_neighbours(DRAWS, rng)):
+        whole = np.zeros((len(system.b), DRAWS))
+        for camera in range(2):
+            whole[tracks.rows(system, camera)] = errors[tracks.seen[:, camera], camera]
+        residuals = whole - system.A @ system.solve(system.A.T @ whole)
+        expected.append(tracks.products(tracks.gather(system, residuals))[0])
+    weight = np.sqrt(counts)
+    design = np.stack(expected, axis=-1) * weight[:, None, None]
+    return np.stack([nnls(design[:, axis], seen[:, axis] * weight)[0] for axis in range(2)], axis=1)
+
+
+class Tracks:
+    """A family's factors in the order of tracks, of time within each, and of the two cameras.
+
+    Args:
+        active: all factors of a system.
+        family: the one that is meant.
+    """
+
+    def __init__(self, active: Active, family: str) -> None:
+        views: dict[str, dict[int, list[int]]] = defaultdict(dict)
+        for position, (_, _, record) in enumerate(active):
+            if record.family == family and record.camera in CAMERAS:
+                track = record.what.split(" in ")[0]
+                views[track].setdefault(record.stamp_ns, [-1, -1])[CAMERAS.index(record.camera)] = position
+        self.track: Int = np.repeat(np.arange(len(views)), [len(seen) for seen in views.values()])
+        """Shape (n,), one entry for every keyframe of every track."""
+        self.place: Int = np.array([i for seen in views.values() for i in range(len(seen))], dtype=np.int64)
+        """Shape (n,), number of the keyframe in its track."""
+        factor = [seen[stamp] for seen in views.values() for stamp in sorted(seen)]
+        self._factor: Int = np.array(factor, dtype=np.int64).reshape(-1, 2)
+        self.seen: Bool = self._factor >= 0
+        """Shape (n, 2), in which of the two images."""
+        stamps = np.array([stamp for seen in views.values() for stamp in sorted(seen)], dtype=np.int64)
+        order = np.argsort(stamps, kind="stable")
+        self.images = np.split(order, np.flatnonzero(np.diff(stamps[order])) + 1) if len(order) else []
+        """Entries of one keyframe each, in the order of time."""
+        self.stamps: list[int] = [int(stamps[i[0]]) for i in self.images]
+        self.keyframes = [_keyframe(active[self._factor[i[0]].max()][1]) for i in self.images]
+        px = self._pixels(active)
+        diagonal = float(np.linalg.norm(np.ptp(px, axis=0))) if len(px) else 1.0
+        self._apart = [np.linalg.norm(px[i][:, None] - px[i], axis=2) / diagonal for i in self.images]
+        self.kernels = [np.exp(-apart / RANGE) for apart in self._apart]
+        """By keyframe: correlation of what neighbours share, shape (m, m)."""
+
+    def _pixels(self, active: Active) -> Float:
+        """Shape (n, 2), in one of the two images."""
+        measured = [active[max(pair)][1].measured() for pair in self._factor]  # type: ignore[attr-defined]
+        return np.array(measured, dtype=np.float64).reshape(-1, 2)
+
+    def rows(self, system: LinearSystem, camera: int) -> Int:
+        """Rows (m, 2) of what one camera saw."""
+        return self.first_rows(system)[self.seen[:, camera], camera][:, None] + np.arange(2)
+
+    def first_rows(self, system: LinearSystem) -> Int:
+        """First row (n, 2) of every factor; meaningless where the camera saw nothing."""
+        return system.starts[self._factor]
+
+    def gather(self, system: LinearSystem, residuals: Float) -> Float:
+        """Residuals (rows, k) as (n, camera, axis, k), zero where the camera saw nothing."""
+        own = np.zeros((len(self.track), 2, 2, residuals.shape[1]))
+        for camera in range(2):
+            own[self.seen[:, camera], camera] = residuals[self.rows(system, camera)]
+        return own
+
+    def products(self, own: Float) -> tuple[Float, Float]:
+        """Mean products of residuals (n, camera, axis, k) of one track, and of how many.
+
+        Returns:
+            shape (s, axis) and (s,): 0, 1, ... keyframes apart in one camera, then in different cameras; then
+            neighbours in one image.
+        """
+        means, counts = [], []
+        for other in (False, True):
+            for lag in range(LAGS + 1):
+                last = len(own) - lag
+                late, seen = (own[lag:, ::-1], self.seen[lag:, ::-1]) if other else (own[lag:], self.seen[lag:])
+                both = (self.track[lag:] == self.track[:last])[:, None] & seen & self.seen[:last]
+                counts.append(max(int(both.sum()), 1))
+                means.append((late * own[:last]).sum(axis=(0, 1)).mean(axis=-1) / counts[-1] if both.any() else [0, 0])
+        for low, high in pairwise(NEAR):
+            total, count = self._neighbours(own, low, high)
+            means.append(total / max(count, 1))
+            counts.append(max(count, 1))
+        return np.array(means, dtype=np.float64), np.array(counts, dtype=np.float64)
+
+    def _neighbours(self, own: Float, low: float, high: float) -> tuple[Float, int]:
+        """Sum (axis,) over pairs of one image that are so far apart, and their number."""
+        total, count = np.zeros(2), 0
+        for image, apart in zip(self.images, self._apart, strict=True):
+            near = ((apart > low) & (apart <= high)).astype(np.float64)
+            values = own[image]
+            others = (near @ values.reshape(len(image), -1)).reshape(values.shape)
+            total += (others * values).sum(axis=(0, 1)).mean(axis=-1)
+            seen = self.seen[image].astype(np.float64)
+            count += int((near @ seen * seen).sum())
+        return total, count
+
+    def draw(self, rho: float, shared: bool, count: int, rng: np.random.Generator) -> Float:
+        """Errors (n, camera, axis, count) of unit variance that persist along each track."""
+        errors = rng.normal(size=(len(self.track), 1 if shared else 2, 2, count))
+        if rho > 0.0:
+            errors[self.place > 0] *= np.sqrt(1 - rho**2)
+            for place in range(1, int(self.place.max()) + 1):
+                at = np.flatnonzero(self.place == place)
+                errors[at] += rho * errors[at - 1]
+        return np.broadcast_to(errors, (len(self.track), 2, 2, count))
+
+    def draw_neighbours(self, count: int, rng: np.random.Generator) -> Float:
+        """Errors (n, camera, axis, count) of unit variance that neighbours and both images of a keyframe share."""
+        errors = np.zeros((len(self.track), 1, 2, count))
+        for image, kernel in zip(self.images, self.kernels, strict=True):
+            factor = np.linalg.cholesky(kernel + 1e-6 * np.eye(len(image)))
+            errors[image, 0] = np.einsum("ij,jak->iak", factor, rng.normal(size=(len(image), 2, count)))
+        return np.broadcast_to(errors, (len(self.track), 2, 2, count))
+
+
+def _keyframe(factor: gtsam.NonlinearFactor) -> int:
+    return next(key for key in factor.keys() if keys.kind(key) == "x")

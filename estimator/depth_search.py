@@ -14,11 +14,12 @@ class DepthSearch:
         self._engine = engine
         self._model: DepthModel = engine.rig.kinect.model
         self._images: DepthImages | None = None
-        self._view: DepthView | None = None
+        self.view: DepthView | None = None
+        """The newest."""
 
     def see(self, view: DepthView) -> None:
         """A view of the machine at rest."""
-        self._view = view
+        self.view = view
         self.search()
 
     def search(self) -> None:
@@ -33,7 +34,7 @@ class DepthSearch:
 
     def cylinder(self, pipe_id: str, pipe: PredictedPipe) -> CylinderSighting | Rejection | None:
         """A pipe in what was seen last; None when nothing was."""
-        view = self._view
+        view = self.view
         if view is None:
             return None
         points = view.points_m

@@ -24,7 +24,7 @@ from ..factors.calibration import (
 )
 from ..factors.camera import CameraModel
 from ..factors.geometry import pose3
-from ..factors.links import gauge_prior, mount_factor, mount_pose
+from ..factors.links import gauge_prior, mount_factor, mount_pose, weak_pose_prior
 from ..factors.measurements import (
     CylinderSighting,
     Event,
@@ -45,6 +45,7 @@ from .graph import Record, State, Update
 from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
 from .observability import why_no_base
+from .odometry import FAMILY as ODOMETRY
 from .odometry import Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .placement import place
@@ -345,6 +346,22 @@ class Engine:
         self._take(update)
         self._retry_picks()
 
+    def place_base(self, o_T_b: gtsam.Pose3, stamp_ns: int, what: str) -> None:
+        """{b} by surfaces that both cameras see: landmarks on them hold it, and leave loose what they do not fix."""
+        update = Update()
+        update.guess(self.base, o_T_b)
+        record = Record("gauge", "start of {b}", stamp_ns, "weak prior of {b}", rejectable=False)
+        update.add(weak_pose_prior(self.base, o_T_b, 3.0, 3.0), record)
+        self._take(update)
+        by_keyframe: dict[int, dict[int, int]] = {}
+        for track, index in self.odometry.seen_in.items():
+            by_keyframe.setdefault(index, {})[track] = self.odometry.observations[track]
+        for index, observations in by_keyframe.items():
+            pose = self.state.pose(keys.keyframe(index))
+            self._take(self.surfaces.lay(self.base, pose, observations))
+        self.events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
+        self.flush()
+
     def _see_from_machine(self) -> None:
         """Boards in the machine's colour images tie {b} to them directly, and may give it its first place."""
         base, extrinsics = keys.base(0), keys.extrinsics("b_rgb")
@@ -478,8 +495,13 @@ class Engine:
             )
             for p in self.lost_picks()
         ]
+        given_up = [
+            Rejection(self.end_ns, ODOMETRY, keys.words(key), "undetermined where its matches put it; views", 0.0, 1.0)
+            for key in self.solver.dropped
+        ]
         return [
             *self.rejected,
+            *given_up,
             *self.boards.rejected,
             *self.boards.held_back(),
             *self.pipes.rejected,

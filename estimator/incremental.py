@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from ..factors.errors import ObservabilityError
+from ..factors import keys
 from .graph import FactorLog, Record, Update
 from .marginal import FAMILY, gaussian_of, marginal
-from .observability import determined
+from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
 
@@ -40,6 +40,10 @@ SETTLE_ROUNDS = 2
 """Relinearisations before variables leave: what they say is frozen where it is taken."""
 
 
+MOST_DROPPED = 50
+"""Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
+
+
 class Incremental:
     """iSAM2 with the bookkeeping that lets single measurements be switched off again."""
 
@@ -49,12 +53,15 @@ class Incremental:
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
         self.log = FactorLog()
+        self.dropped: list[int] = []
+        """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
 
     def update(self, update: Update, remove: Iterable[int] = ()) -> gtsam.Values:
         """Takes the new factors and guesses, switches off the factors `remove`, and returns the estimate.
 
         Raises:
-            ObservabilityError: a variable is not determined by the factors, at any linearisation.
+            ObservabilityError: a variable other than a landmark is not determined by the factors, at any
+                linearisation.
         """
         graph = gtsam.NonlinearFactorGraph()
         for factor in update.factors:
@@ -69,10 +76,29 @@ class Incremental:
                 self._isam.update(graph, update.values, slots)
             self._slots += range(first, first + len(update.factors))
             self._values = self._isam.calculateEstimate()
-        except ObservabilityError:
+        except Undetermined:
             self._values.insert(update.values)
-            self._rebuild()
+            self._restart()
         return gtsam.Values(self._values)
+
+    def _restart(self) -> None:
+        """Starts iSAM2 anew; landmarks that stay undetermined are given up, one after the other."""
+        for _ in range(MOST_DROPPED):
+            try:
+                self._rebuild()
+            except Undetermined as error:
+                if keys.kind(error.key) != "l":
+                    raise
+                self._drop(error.key)
+            else:
+                return
+        self._rebuild()
+
+    def _drop(self, landmark: int) -> None:
+        """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
+        self.dropped.append(landmark)
+        self.log.off.update(i for i, factor, _ in self.log.active() if landmark in factor.keys())
+        self._values.erase(landmark)
 
     def _rebuild(self) -> None:
         """Starts iSAM2 anew from a damped batch optimum.
@@ -134,14 +160,19 @@ class Incremental:
         for key in gone | without:
             values.erase(key)
         self.log = log
-        self._restart(values)
+        self._begin(values)
         return gtsam.Values(self._values)
 
-    def _restart(self, values: gtsam.Values) -> None:
+    def _begin(self, values: gtsam.Values) -> None:
         """iSAM2 anew on all factors, linearised at `values`."""
         self._isam = gtsam.ISAM2(_parameters())
-        with determined():
-            self._isam.update(self.log.graph(), values)
+        self._values = values
+        try:
+            with determined():
+                self._isam.update(self.log.graph(), values)
+        except Undetermined:
+            self._restart()
+            return
         self._slots = list(range(len(self.log.factors)))
         self._values = self._isam.calculateEstimate()
 
@@ -149,8 +180,12 @@ class Incremental:
         """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
         empty, none = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for _ in range(rounds):
-            with determined():
-                result = self._isam.update(empty, none, force_relinearize=True)
+            try:
+                with determined():
+                    result = self._isam.update(empty, none, force_relinearize=True)
+            except Undetermined:
+                self._restart()
+                continue
             if result.getVariablesRelinearized() == 0:
                 break
         self._values = self._isam.calculateEstimate()
@@ -163,7 +198,7 @@ class Incremental:
         ends = np.cumsum(joint.widths)
         columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
         chosen = np.concatenate([columns[key] for key in keys])
-        return covariance[np.ix_(chosen, chosen)]
+        return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
 
 
 def _parameters() -> gtsam.ISAM2Params:

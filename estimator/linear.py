@@ -8,7 +8,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -78,8 +78,9 @@ class LinearSystem:
         self.b = np.zeros(shape[0])
         self.b[i[~keep]] = entries[2][~keep]
         self._columns = column
-        self.inflation = np.ones(shape[0])
-        """Variance of each row's error over what its whitening says, for errors that are correlated among rows."""
+        self.root: csr_matrix | None = None
+        """Shape (rows, rows): times its transpose the covariance of the whitened errors, where they are correlated;
+        None for the identity."""
 
     @cached_property
     def _normal(self) -> NormalEquations:
@@ -102,12 +103,21 @@ class LinearSystem:
         return full
 
     def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
-        """`C^1/2 A (A^T A)^-1 J^T`, shape (rows, m), C the rows' inflation: its rows' squares are the contributions.
+        """`R^T A (A^T A)^-1 J^T`, shape (rows, m), R R^T the errors' covariance: its squares are the contributions.
 
-        With C = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the larger errors
-        (the sandwich form, Huber 1967).
+        With R = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the errors as they
+        are (the sandwich form, Huber 1967).
         """
-        return np.sqrt(self.inflation)[:, None] * (self.A @ self.solve(self.selector(blocks)))
+        return self.weigh(self.A @ self.solve(self.selector(blocks)))
+
+    def weigh(self, sensitivity: Float) -> Float:
+        """`R^T Y` of sensitivities Y to the whitened errors, (rows, m)."""
+        return sensitivity if self.root is None else np.asarray(self.root.T @ sensitivity)
+
+    def error_covariance(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Float:
+        """Covariance (k, k) of the whitened errors of some rows (index or mask)."""
+        root = csr_matrix(identity(len(self.b)))[rows] if self.root is None else self.root[rows]
+        return np.asarray((root @ root.T).todense())
 
     def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:
         """Covariance of `J x`, shape (m, m)."""
@@ -124,20 +134,17 @@ class LinearSystem:
     def marginals(self, keys: Sequence[int]) -> list[Float]:
         """Each variable's own covariance."""
         found = []
-        inflated = np.any(self.inflation != 1.0)
-        middle = csr_matrix(self.A.T @ self.A.multiply(self.inflation[:, None])) if inflated else None
         for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys]):
             columns = [self.columns[keys[i]] for i in chunk]
-            if middle is None:
+            if self.root is None:
                 found += self._normal.inverse_blocks(columns)
                 continue
             right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
             at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
             for column, (start, stop) in zip(columns, pairwise(at), strict=True):
                 right[column, start:stop] = np.eye(stop - start)
-            inverse = self.solve(right)
-            outer = middle @ inverse
-            found += [inverse[:, a:b].T @ outer[:, a:b] for a, b in pairwise(at)]
+            influence = self.weigh(self.A @ self.solve(right))
+            found += [influence[:, a:b].T @ influence[:, a:b] for a, b in pairwise(at)]
         return found
 
     def hats(self, positions: Sequence[int]) -> list[Float]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.noise import robust_scale
-from .correlation import Active, track_inflation
+from .correlation import Active, correlate
 from .graph import FactorLog
 from .linear import LinearSystem
 
@@ -25,7 +25,7 @@ class Linearised:
     norms: Float
     """(factors,), norm of each whitened residual, the robust loss undone."""
     inflation: float = 1.0
-    """Variance of the tracks' errors over what they state."""
+    """Variance of the tracks' errors over what they state, on average."""
 
 
 def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
@@ -52,8 +52,8 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
 
 def with_correlated_tracks(at: Linearised, family: str) -> Linearised:
     """The same with covariances that know that the errors of a family's tracks are correlated."""
-    records = [record for _, _, record in at.active]
-    inflation = track_inflation(records, at.system, family)
-    of_tracks = np.array([r.family == family for r in records])
-    at.system.inflation[np.repeat(of_tracks, at.system.rows)] = inflation
-    return Linearised(at.values, at.active, at.system, at.norms, inflation)
+    found = correlate(at.active, at.values, at.system, family)
+    if found is None:
+        return at
+    at.system.root = found.root
+    return Linearised(at.values, at.active, at.system, at.norms, found.inflation)

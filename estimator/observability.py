@@ -27,12 +27,20 @@ _MISSING = {
 _VARIABLE = re.compile(r"near\s+variable\s+(\d+)")
 
 
+class Undetermined(ObservabilityError):
+    """A variable that the factors leave undetermined."""
+
+    def __init__(self, key: int) -> None:
+        super().__init__(not_observable(key))
+        self.key = key
+
+
 @contextmanager
 def determined() -> Iterator[None]:
     """Tells a solver's complaint about an indeterminate variable in words.
 
     Raises:
-        ObservabilityError: names the variable and what is missing.
+        Undetermined: names the variable and what is missing.
     """
     try:
         yield
@@ -40,7 +48,7 @@ def determined() -> Iterator[None]:
         found = _VARIABLE.search(" ".join(str(error).split()))
         if found is None:
             raise
-        raise ObservabilityError(not_observable(int(found.group(1)))) from error
+        raise Undetermined(int(found.group(1))) from error
 
 
 def not_observable(key: int) -> str:
@@ -51,7 +59,10 @@ def not_observable(key: int) -> str:
 def why_no_base(mount: Mount | None, board_known: bool) -> str:
     """The missing link between {o} and {b}, in words."""
     if mount is None:
-        return "{b} is not observable: the rig has no mount (f_T_b); add the section `mount` to the rig file"
+        return (
+            "{b} is not observable: the rig has no mount (f_T_b), and Kinect and mobile camera share too few textured "
+            "surfaces; add the section `mount` to the rig file, or show both cameras the same things"
+        )
     if not board_known:
         return (
             f"{{b}} is not observable: board {mount.board} was never seen well enough by the mobile camera; "

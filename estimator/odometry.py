@@ -57,6 +57,8 @@ class Odometry:
         self._waiting: dict[int, tuple[int, StereoFrame, int]] = {}
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
+        self.seen_in: dict[int, int] = {}
+        """The last keyframe that saw a landmark."""
         self.observations: dict[int, int] = {}
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
@@ -216,6 +218,7 @@ class Odometry:
             record = Record(FAMILY, f"tracks {camera}", frame.stamp_ns, f"track {track} in {camera}", camera=camera)
             update.add(mobile_projection(camera, px, model, pose, point), record)
         self.observations[track] = self.observations.get(track, 0) + 1
+        self.seen_in[track] = index
 
     def _create(self, update: Update, frame: StereoFrame, rows: list[int], index: int, pose: gtsam.Pose3) -> None:
         """New landmarks from tracks seen in an earlier keyframe too; others wait for their second one."""

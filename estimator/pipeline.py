@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator
 from ..factors.errors import LogError, ObservabilityError
 from ..factors.rig import Rig
 from ..frontends.fiducials.messages import UNKNOWN_IDS
+from .base_search import BaseSearch
 from .bundle import Bundle
 from .depth_search import DepthSearch
 from .engine import Engine
@@ -21,6 +22,7 @@ class Pipeline:
         self.engine = Engine(rig, {}, associate)
         self._outlines = OutlineSearch(self.engine)
         self._depths = DepthSearch(self.engine)
+        self._base = BaseSearch(self.engine)
 
     def run(self, seen: Iterable[Sensed]) -> Iterator[int]:
         """Takes what the front ends see in the order of time; yields each stamp (ns) when it has been worked in."""
@@ -36,9 +38,11 @@ class Pipeline:
         engine.pick_images.update(sensed.clicked)
         if sensed.pair is not None and sensed.stamp_ns in engine.keyframe_at:
             self._outlines.see(sensed.pair, sensed.bundle.picks)
+            self._base.see(sensed.pair)
         if sensed.depth is not None:
             engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud))
             self._depths.see(sensed.depth)
+            self._base.search(sensed.depth)
 
     def look_back(self, sensed: Sensed) -> bool:
         """Clicks in a frame that was taken in before: it becomes a keyframe. False where that is too late."""
@@ -52,6 +56,8 @@ class Pipeline:
     def complete(self) -> None:
         """What waited for something else gets its last chance."""
         self.engine.revisit()
+        if self._base.search(self._depths.view, last=True):
+            self.engine.revisit()
         self._depths.search()
 
     def check(self, report: SensingReport) -> None:

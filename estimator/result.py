@@ -28,6 +28,18 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionEstimate:
+    """The mobile camera at one keyframe in itself at an earlier one, `from_T_to`."""
+
+    from_ns: int
+    to_ns: int
+    matrix: Float
+    """Shape (4, 4)."""
+    covariance: Float
+    """Shape (6, 6), from the joint of both poses: translation first, fixed axes of the earlier one, m and rad."""
+
+
+@dataclass(frozen=True, slots=True)
 class NearestSurface:
     """The mapped surface next to a point that is not the point's own pipe."""
 
@@ -216,3 +228,5 @@ class Result:
     pick_views: tuple[PickView, ...] = ()
     picks: tuple[PickRecord, ...] = ()
     surroundings: SurfaceMap | None = None
+    motions: tuple[MotionEstimate, ...] = ()
+    """Of the mobile camera, over windows of a second."""

@@ -55,6 +55,8 @@ class Sensors:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self.cameras: dict[str, CameraModel] = {}
+        self._given: dict[str, CameraModel] = {}
+        """The last calibration that came, as the decoder gave it: mostly the very same object."""
         self._stereo: StereoFrontEnd | None = None
         self._markers: dict[str, MarkerFrontEnd] = {}
         self.kinect = DepthSensor(rig.kinect)
@@ -64,6 +66,9 @@ class Sensors:
 
     def calibrate(self, camera: str, model: CameraModel) -> None:
         """The first calibration of a camera counts; one that changes during the run is an error."""
+        if self._given.get(camera) is model:
+            return
+        self._given[camera] = model
         named = replace(model, name=camera)
         known = self.cameras.setdefault(camera, named)
         if known is not named and not (np.allclose(known.K, named.K) and known.width == named.width):

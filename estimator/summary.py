@@ -23,12 +23,13 @@ from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
-from .agreement import cylinder_tests
 from .batch import BatchSolution
 from .boards import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point
+from .motions import motions
+from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .result import (
@@ -88,6 +89,7 @@ class Summary:
             pick_views=pick_views(engine, self._values, self._system),
             picks=pick_records(engine),
             surroundings=compact_map(around),
+            motions=motions(self._values, self._system, engine.odometry.keyframe_stamps),
         )
 
     def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
@@ -350,10 +352,8 @@ class Summary:
         tested = ("mount", "known distances", "board geometry", "calibration priors")
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
-        cylinders = cylinder_tests(self._engine.depth_pipes, self._active, self._system, self._values)
-        priors += cylinders
-        paths |= {t.record.what: t.sigma for t in cylinders}
-        return judge(families, priors, paths)
+        cylinders, ways = compared_with_cloud(self._engine, self._active, self._system, self._values)
+        return judge(families, [*priors, *cylinders], {**paths, **ways})
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""

@@ -7,6 +7,26 @@ Float = NDArray[np.float64]
 
 SAME_PLACE_M = 0.02
 SAME_DIRECTION_RAD = 0.035
+LEAST_OWN_SHARE = 0.1
+"""Part of a variance that is the view's own at least: two images of one place differ by their noise."""
+
+
+def added_covariance(total: Float, common: float, views: int) -> Float:
+    """What the n-th of equal views adds to those before it, written as the covariance of an independent view.
+
+    With the own part S = total - C of each view and the common part C = common^2 I, the mean of n views has the
+    information n (S + n C)^-1. The n-th view brings the n-th increase of that, V^-1 = n (S + n C)^-1 -
+    (n - 1) (S + (n - 1) C)^-1, so V = (S + n C) S^-1 (S + (n - 1) C): views from one place never know more than C^-1.
+
+    Args:
+        total: of one view, shape (..., 2, 2).
+        common: sigma of the common part; at most what leaves a tenth of every variance to the view's own part.
+        views: n, this view included.
+    """
+    least = np.linalg.eigvalsh(total)[..., :1, None]
+    C = np.minimum(common**2, (1.0 - LEAST_OWN_SHARE) * least) * np.eye(2)
+    S = total - C
+    return np.asarray((S + views * C) @ np.linalg.solve(S, S + (views - 1) * C), float)
 
 
 class ViewCells:

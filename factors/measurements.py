@@ -29,9 +29,12 @@ class MarkerSighting:
     corners_px: Float
     """Shape (4, 2), ideal pixels."""
     covariance_px2: Float
-    """Shape (4, 2, 2), of the ideal pixels, independent part of each corner."""
+    """Shape (4, 2, 2), of the ideal pixels."""
     raw_px: Float
     """Shape (4, 2), as found in the image, for drawing."""
+    common_px: float | None = None
+    """Sigma of the part of it that views from the same place have in common; None: not known, so that the rig's
+    `marker_common_px` comes on top of the covariance."""
 
 
 @dataclass(frozen=True, slots=True)

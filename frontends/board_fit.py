@@ -64,7 +64,7 @@ class BoardFit:
 
 
 def board_corners(sightings: Sequence[MarkerSighting], board: Board, common_px: float) -> BoardCorners:
-    """The corners of sightings of `board`, in one image; `common_px` is added to each corner's own noise."""
+    """The corners of sightings of `board`, in one image; `common_px` as in `corner_covariance`."""
     places = {marker.id: marker for marker in board.markers}
     index, centres, offsets = [], [], []
     for k, sighting in enumerate(sightings):
@@ -73,7 +73,7 @@ def board_corners(sightings: Sequence[MarkerSighting], board: Board, common_px: 
         index += [k] * 4
         centres += [place.centre_m] * 4
         offsets.append(UNIT_SQUARE @ np.array([[c, s], [-s, c]]))
-    covariance = np.concatenate([s.covariance_px2 for s in sightings]) + common_px**2 * np.eye(2)
+    covariance = np.concatenate([corner_covariance(s, common_px) for s in sightings])
     return BoardCorners(
         np.array(index),
         np.array(centres, float),
@@ -81,6 +81,16 @@ def board_corners(sightings: Sequence[MarkerSighting], board: Board, common_px: 
         np.concatenate([s.corners_px for s in sightings]),
         covariance,
     )
+
+
+def corner_covariance(sighting: MarkerSighting, common_px: float) -> Float:
+    """Covariance of the four corners in one image, (4, 2, 2).
+
+    Args:
+        common_px: what views from the same place have in common, where the sighting does not say it itself.
+    """
+    own = np.asarray(sighting.covariance_px2, float)
+    return own if sighting.common_px is not None else own + common_px**2 * np.eye(2)
 
 
 def fit_board(

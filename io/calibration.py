@@ -1,6 +1,7 @@
 """A calibration message's numbers to a `CameraModel`, with the checks that no estimate may do without."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -53,19 +54,35 @@ def camera_model(calibration: Calibration, label: str) -> CameraModel:
         LogError: unknown model, not calibrated, not finite, or in contradiction to its own image size.
     """
     c = calibration
-    K = _matrix(c.K, (3, 3), "K", label)
+    text = (c.frame_id, c.width, c.height, c.model, c.binning, c.roi)
+    numbers = tuple(np.asarray(values, np.float64).tobytes() for values in (c.D, c.K, c.R, c.P))
+    try:
+        return _camera_model(text, numbers)
+    except LogError as error:
+        raise LogError(f"{label}: {error}") from error
+
+
+@lru_cache(maxsize=64)
+def _camera_model(
+    text: tuple[str, int, int, str, tuple[int, int], tuple[int, int, int, int]], numbers: tuple[bytes, ...]
+) -> CameraModel:
+    """A calibration is sent with every image, and is the same each time."""
+    frame_id, width, height, model, binning, roi = text
+    D, K, R, P = (np.frombuffer(n) for n in numbers)
+    c = Calibration(frame_id, width, height, model, D, K, R, P, binning, roi)
+    K = _matrix(K, (3, 3), "K")
     if not np.any(K):
-        raise LogError(f"{label}: the camera is not calibrated (K is zero); calibrate it or record its calibration")
-    model, D = _distortion(c, label)
-    R = _matrix(c.R, (3, 3), "R", label)
+        raise LogError("the camera is not calibrated (K is zero); calibrate it or record its calibration")
+    model, D = _distortion(c)
+    R = _matrix(R, (3, 3), "R")
     R = R if np.any(R) else np.eye(3)
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
-        raise LogError(f"{label}: R is no rotation; record the calibration again")
-    P = _matrix(c.P, (3, 4), "P", label)
+        raise LogError("R is no rotation; record the calibration again")
+    P = _matrix(P, (3, 4), "P")
     # P is of the rectified pair's camera: its own focal length gives the baseline
     baseline = float(-P[0, 3] / P[0, 0]) + 0.0 if P[0, 0] > 0 else None
     camera = CameraModel(c.frame_id, c.width, c.height, K, model, D, R, baseline)
-    return _checked(_cropped(camera, c), label)
+    return _checked(_cropped(camera, c))
 
 
 def check_image_size(camera: CameraModel, width: int, height: int, info_topic: str, image_topic: str) -> None:
@@ -77,32 +94,32 @@ def check_image_size(camera: CameraModel, width: int, height: int, info_topic: s
         )
 
 
-def _matrix(values: ArrayLike, shape: tuple[int, int], name: str, label: str) -> Float:
+def _matrix(values: ArrayLike, shape: tuple[int, int], name: str) -> Float:
     array = np.asarray(values, dtype=np.float64).reshape(-1)
     if array.size == 0:
         return np.zeros(shape)
     if array.size != shape[0] * shape[1]:
-        raise LogError(f"{label}: {name} has {array.size} numbers, not {shape[0] * shape[1]}")
+        raise LogError(f"{name} has {array.size} numbers, not {shape[0] * shape[1]}")
     if not np.isfinite(array).all():
-        raise LogError(f"{label}: {name} holds numbers that are not finite; record the calibration again")
+        raise LogError(f"{name} holds numbers that are not finite; record the calibration again")
     return array.reshape(shape)
 
 
-def _distortion(c: Calibration, label: str) -> tuple[str, Float]:
+def _distortion(c: Calibration) -> tuple[str, Float]:
     model = _MODELS.get(c.model.strip().lower())
     if model is None:
         known = "plumb_bob, rational_polynomial, equidistant"
-        raise LogError(f"{label}: unknown camera model {c.model!r}; calibrate with one of {known}")
+        raise LogError(f"unknown camera model {c.model!r}; calibrate with one of {known}")
     D: NDArray[Any] = np.asarray(c.D, dtype=np.float64).reshape(-1)
     if not np.isfinite(D).all():
-        raise LogError(f"{label}: D holds numbers that are not finite; record the calibration again")
+        raise LogError("D holds numbers that are not finite; record the calibration again")
     if model == "plumb_bob" and D.size in (8, 12, 14):
         model = "rational_polynomial"  # what OpenCV makes of so many coefficients
     if model == "rational_polynomial" and D.size in (4, 5):
         model = "plumb_bob"
     if D.size not in _COEFFICIENTS[model]:
         expected = " or ".join(str(n) for n in _COEFFICIENTS[model])
-        raise LogError(f"{label}: {D.size} distortion coefficients, {c.model or 'plumb_bob'} has {expected}")
+        raise LogError(f"{D.size} distortion coefficients, {c.model or 'plumb_bob'} has {expected}")
     if model != "equidistant" and not np.any(D):
         return "none", np.zeros(0)
     return model, D
@@ -128,15 +145,15 @@ def _cropped(camera: CameraModel, c: Calibration) -> CameraModel:
     )
 
 
-def _checked(camera: CameraModel, label: str) -> CameraModel:
+def _checked(camera: CameraModel) -> CameraModel:
     if camera.width <= 0 or camera.height <= 0:
-        raise LogError(f"{label}: image size {camera.width}x{camera.height}; record the calibration again")
+        raise LogError(f"image size {camera.width}x{camera.height}; record the calibration again")
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     if fx <= 0 or fy <= 0 or not np.allclose(camera.K[2], (0, 0, 1)) or abs(camera.K[1, 0]) > 1e-9:
-        raise LogError(f"{label}: K is no camera matrix (fx {fx:g}, fy {fy:g}); record the calibration again")
+        raise LogError(f"K is no camera matrix (fx {fx:g}, fy {fy:g}); record the calibration again")
     if not (0 <= cx < camera.width and 0 <= cy < camera.height):
         raise LogError(
-            f"{label}: the calibration contradicts the image size: its centre ({cx:.0f}, {cy:.0f}) lies outside "
+            f"the calibration contradicts the image size: its centre ({cx:.0f}, {cy:.0f}) lies outside "
             f"{camera.width}x{camera.height}; record images and calibration in one resolution"
         )
     return camera

@@ -30,15 +30,17 @@ class Campaign:
     """Run i takes scenario i modulo their number."""
     leave_out: bool = False
     decisions: bool = False
+    sensitivity: bool = False
 
     def order(self, number: int) -> RunOrder:
         """The order of one run."""
-        return RunOrder(
-            number, self.level, self.scenarios[number % len(self.scenarios)], self.leave_out, self.decisions
-        )
+        scenario = self.scenarios[number % len(self.scenarios)]
+        return RunOrder(number, self.level, scenario, self.leave_out, self.decisions, self.sensitivity)
 
 
-def open_campaign(source: str, level: Level, leave_out: bool = False, decisions: bool = False) -> Campaign:
+def open_campaign(
+    source: str, level: Level, leave_out: bool = False, decisions: bool = False, sensitivity: bool = False
+) -> Campaign:
     """A campaign from a scenario file or the name of one that comes with surecut.
 
     Raises:
@@ -52,7 +54,7 @@ def open_campaign(source: str, level: Level, leave_out: bool = False, decisions:
             names = ", ".join(sorted(one.stem for one in SCENARIOS.glob("*.yaml")))
             raise SurecutError(f"{source}: no such scenario; give a YAML file or one of {names}")
         found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(path))
-    return Campaign(level, found, leave_out, decisions)
+    return Campaign(level, found, leave_out, decisions, sensitivity)
 
 
 def run_campaign(
@@ -95,6 +97,7 @@ def claim_folder(folder: Path, campaign: Campaign) -> None:
         "scenarios": [dict(scenario) for scenario in campaign.scenarios],
         "leave_out": campaign.leave_out,
         "decisions": campaign.decisions,
+        **({"sensitivity": True} if campaign.sensitivity else {}),
     }
     path = folder / SETTINGS
     if path.exists():

@@ -110,5 +110,6 @@ def _true_rig(known: Mapping[str, Any]) -> TrueRig:
         # The sensor reads z (1 + scale) + offset; the state is what turns a reading into the true depth.
         depth_offset_m=-float(known["depth_offset_m"]) / (1.0 + scale),
         depth_scale=1.0 / (1.0 + scale) - 1.0,
+        depth_rays=np.zeros(3),
         boards={},
     )

@@ -1,53 +1,125 @@
-"""Real recordings that have a reference, in one table: marker distances by laser, and trajectories."""
+"""Real recordings that have a reference, in one table: distances by laser, trajectories, corners and angles."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import yaml
 from scipy.stats import norm
 
+from ..estimator.executor import Executor
 from ..estimator.optimise import optimise
 from ..estimator.result import Result
 from ..factors.errors import SurecutError
-from ..factors.rig import Board, Distance, Marker, Rig, dump_rig
+from ..factors.rig import Board, Distance, Marker, Noise, Pose, Rig, Stereo, dump_rig
 from ..io.messages import PoseBody
 from ..io.reader import LogReader
+from .campaign import write_whole
+from .campaign_real_photos import photo_rows, turntable_rows
+from .campaign_real_row import RealRow
 from .evaluate_trajectory import Trajectory, compare_trajectories, read_tum
 
 HELD_OUT_SIGMA = float(norm.ppf(0.975))
 
 
 @dataclass(frozen=True, slots=True)
-class RealRow:
-    """One comparison."""
+class RealTask:
+    """One estimate, or one set of photographs."""
 
+    folder: str
+    """Of all recordings."""
     recording: str
-    quantity: str
-    value: str
-    reference: str
-    """`truth` (an instrument) or `reference` (another estimator)."""
+    kind: Literal["aviary", "held_out", "tags", "kitti", "photos", "turntable"]
+    key: str = ""
+    """Of a held-out distance: its id."""
+
+    @property
+    def name(self) -> str:
+        """For files and progress."""
+        return "-".join(part.replace("/", "_") for part in (self.recording, self.kind, self.key) if part)
 
 
-def real_table(folder: Path) -> list[RealRow]:
-    """Everything under a folder of real recordings that has a reference; what cannot be run says why."""
-    cases: tuple[tuple[str, Callable[[Path], Iterator[RealRow]]], ...] = (
-        ("aviary", _aviary),
-        ("stereo_tags/collinear", _tags),
-        ("stereo_tags/perch", _tags),
-        ("kitti", _kitti),
-    )
-    rows: list[RealRow] = []
-    for name, case in cases:
-        if not (folder / name).is_dir():
-            continue
-        try:
-            rows += [RealRow(name, row.quantity, row.value, row.reference) for row in case(folder / name)]
-        except SurecutError as error:
-            rows.append(RealRow(name, "no result", str(error), ""))
+def real_tasks(folder: Path) -> list[RealTask]:
+    """What there is to do in a folder of real recordings, the quick ones first."""
+    tasks: list[RealTask] = []
+    if (folder / "photos" / "golden.json").is_file():
+        tasks += [RealTask(str(folder), "photos", kind) for kind in ("photos", "turntable")]
+    tasks += [
+        RealTask(str(folder), name, "tags")
+        for name in ("stereo_tags/collinear", "stereo_tags/perch")
+        if (folder / name / "boards.yaml").is_file()
+    ]
+    if (folder / "kitti" / "kitti1.mcap").is_file():
+        tasks.append(RealTask(str(folder), "kitti", "kitti"))
+    if (folder / "aviary" / "boards.yaml").is_file():
+        boards = yaml.safe_load((folder / "aviary" / "boards.yaml").read_text())
+        tasks.append(RealTask(str(folder), "aviary", "aviary"))
+        tasks += [RealTask(str(folder), "aviary", "held_out", str(one["id"])) for one in boards["distances"]]
+    return tasks
+
+
+def run_real(task: RealTask) -> dict[str, Any]:
+    """Rows of one task as data, or the reason why there are none."""
+    folder = Path(task.folder) / task.recording
+    cases: dict[str, Callable[[], Iterator[RealRow]]] = {
+        "aviary": lambda: _aviary(folder),
+        "tags": lambda: _tags(folder),
+        "kitti": lambda: _kitti(folder),
+        "photos": lambda: photo_rows(folder),
+        "turntable": lambda: turntable_rows(folder),
+    }
+    try:
+        if task.kind == "held_out":
+            return {"rows": [], "held_out": _held_out(folder, task.key)}
+        return {"rows": [asdict(row) for row in cases[task.kind]()]}
+    except SurecutError as error:
+        return {"rows": [asdict(RealRow("", f"no result ({task.kind} {task.key})", str(error), ""))]}
+
+
+def real_table(
+    folder: Path, output: Path, executor: Executor, done: Callable[[str], None] = lambda name: None
+) -> list[RealRow]:
+    """Everything under a folder of real recordings that has a reference; what cannot be run says why.
+
+    Args:
+        folder: of the recordings.
+        output: each task leaves a file here, and is not done again where it is there already.
+        executor: where the tasks run.
+        done: called with the name of each task that is done.
+    """
+    tasks = real_tasks(folder)
+    files = {task: output / "real" / f"{task.name}.json" for task in tasks}
+    (output / "real").mkdir(parents=True, exist_ok=True)
+    for task in tasks:
+        if files[task].exists():
+            done(task.name)
+    for outcome in executor.run(run_real, [task for task in tasks if not files[task].exists()]):
+        found = outcome.value
+        if found is None:
+            found = {"rows": [asdict(RealRow("", "no result", outcome.error or "no reason", ""))]}
+        write_whole(files[outcome.item], json.dumps(found))
+        done(outcome.item.name)
+    return _rows({task: json.loads(files[task].read_text()) for task in tasks})
+
+
+def _rows(found: Mapping[RealTask, Mapping[str, Any]]) -> list[RealRow]:
+    """One table; held-out distances become two lines."""
+    rows = [
+        RealRow(task.recording, row["quantity"], row["value"], row["reference"])
+        for task, one in found.items()
+        for row in one["rows"]
+    ]
+    held = [one["held_out"] for one in found.values() if "held_out" in one]
+    if held:
+        rms_mm = 1e3 * float(np.sqrt(np.mean([one["error_m"] ** 2 for one in held])))
+        inside = sum(one["inside"] for one in held)
+        rows.append(RealRow("aviary", f"{len(held)} distances, each held out, rms", f"{rms_mm:.1f} mm", "truth"))
+        text = f"{inside} of {len(held)}"
+        rows.append(RealRow("aviary", "of these inside the stated 95 % interval", text, "truth"))
     return rows
 
 
@@ -77,7 +149,23 @@ def rig_of_tags(boards: dict[str, Any], held_out: str | None = None) -> Rig:
         for one in boards.get("distances", ())
         if one["id"] != held_out
     ]
-    return Rig(boards=tuple(_board(board) for board in boards["boards"]), distances=tuple(distances))
+    rig = Rig(boards=tuple(_board(board) for board in boards["boards"]), distances=tuple(distances))
+    pair = boards.get("left_T_right")
+    if pair is None:
+        return rig
+    # The calibration of such a pair comes with the recording and was estimated with it; the source states 1 px.
+    cameras = {
+        name: getattr(rig.cameras, name).model_copy(update={"freeze": ("focal", "centre", "distortion")})
+        for name in ("m_left", "m_right")
+    }
+    pose = Pose(translation_m=pair["translation_m"], rotation_vector_rad=pair["rotation_vector_rad"])
+    return rig.model_copy(
+        update={
+            "cameras": rig.cameras.model_copy(update=cameras),
+            "stereo": Stereo(m_left_T_m_right=pose, rotation_sigma_rad=0.002),
+            "noise": Noise(marker_message_sigma_px=1.0, marker_common_px=0.3),
+        }
+    )
 
 
 def _board(board: dict[str, Any]) -> Board:
@@ -99,28 +187,23 @@ def _board(board: dict[str, Any]) -> Board:
 
 def _aviary(folder: Path) -> Iterator[RealRow]:
     boards = yaml.safe_load((folder / "boards.yaml").read_text())
-    log = folder / "aviary.mcap"
-    result = _optimise(log, rig_of_tags(boards))
+    result = _optimise(folder / "aviary.mcap", rig_of_tags(boards))
     errors = np.array([d.distance_m - d.given_m for d in result.distances if d.given_m is not None])
     if len(errors):
         yield RealRow("", f"{len(errors)} given distances, rms", f"{1e3 * np.sqrt((errors**2).mean()):.1f} mm", "truth")
     yield from _against_tum(result, folder / "reference_tum.txt")
-    yield from _left_out(log, boards)
 
 
-def _left_out(log: Path, boards: dict[str, Any]) -> Iterator[RealRow]:
-    """Each distance predicted from the other ones: nothing in the estimate has seen it."""
-    errors, inside = [], 0
-    for one in boards["distances"]:
-        pair = (f"{one['from']['tag']}/{one['from']['corner']}", f"{one['to']['tag']}/{one['to']['corner']}")
-        result = _optimise(log, rig_of_tags(boards, one["id"]), (pair,))
-        found = next(d for d in result.distances if d.given_m is None)
-        error = found.distance_m - one["distance_m"]
-        errors.append(error)
-        inside += abs(error) <= HELD_OUT_SIGMA * np.hypot(found.sigma_m, one["sigma_m"])
-    rms_mm = 1e3 * float(np.sqrt(np.mean(np.square(errors))))
-    yield RealRow("", f"{len(errors)} distances, each held out, rms", f"{rms_mm:.1f} mm", "truth")
-    yield RealRow("", "of these inside the stated 95 % interval", f"{inside} of {len(errors)}", "truth")
+def _held_out(folder: Path, key: str) -> dict[str, Any]:
+    """A distance predicted from the other ones: nothing in the estimate has seen it."""
+    boards = yaml.safe_load((folder / "boards.yaml").read_text())
+    one = next(one for one in boards["distances"] if str(one["id"]) == key)
+    pair = (f"{one['from']['tag']}/{one['from']['corner']}", f"{one['to']['tag']}/{one['to']['corner']}")
+    result = _optimise(folder / "aviary.mcap", rig_of_tags(boards, one["id"]), (pair,))
+    found = next(d for d in result.distances if d.given_m is None)
+    error = found.distance_m - one["distance_m"]
+    inside = abs(error) <= HELD_OUT_SIGMA * np.hypot(found.sigma_m, one["sigma_m"])
+    return {"error_m": float(error), "inside": bool(inside)}
 
 
 def _tags(folder: Path) -> Iterator[RealRow]:

@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -49,6 +49,9 @@ def report_html(title: str, table: CampaignTable, rows: Sequence[Row], notes: Se
         "</div><h2>Errors and their predicted size</h2>",
         f'<div class="scroll">{summary_table(table)}</div>',
         _families(table),
+        _decisions(table),
+        _pairs("Streaming replay against batch, sigmas", table.streaming_sigma, 1.0),
+        _pairs("Way of the points for an input error, mm", table.sensitivity_m, 1e3),
         _reasons(table),
     ]
     return "\n".join(parts) + "</html>\n"
@@ -176,6 +179,29 @@ def _families(table: CampaignTable) -> str:
         )
         text += "</table>"
     return text
+
+
+def _decisions(table: CampaignTable) -> str:
+    if not table.decisions:
+        return ""
+    head = "allowed|cuts|GO|ideal rule's GO|wrong of the GOs|borderline|wrong of these".split("|")
+    lines = ["<h2>Decisions</h2><table><tr>" + "".join(f"<th>{one}</th>" for one in head) + "</tr>"]
+    for one in table.decisions:
+        cells = [f"{100 * one.allowed:g} %", str(one.cuts), f"{100 * one.go:.1f} %", f"{100 * one.ideal_go:.1f} %"]
+        interval = f"{100 * one.wrong_lower:.1f} to {100 * one.wrong_upper:.1f}"
+        cells += [f"{100 * one.wrong:.2f} % ({interval})", str(one.border), f"{100 * one.border_wrong:.2f} %"]
+        lines.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    return "".join(lines) + "</table>"
+
+
+def _pairs(heading: str, values: Mapping[str, tuple[float, float]], factor: float) -> str:
+    """Mean and worst by name."""
+    if not values:
+        return ""
+    lines = [f"<h2>{heading}</h2><table><tr><th></th><th>mean</th><th>worst</th></tr>"]
+    for name, (mean, worst) in values.items():
+        lines.append(f"<tr><td>{html.escape(name)}</td><td>{factor * mean:.3g}</td><td>{factor * worst:.3g}</td></tr>")
+    return "".join(lines) + "</table>"
 
 
 def _reasons(table: CampaignTable) -> str:

@@ -15,6 +15,7 @@ from .campaign_pixels import run_pixels
 from .campaign_row import Row, failed_row, row_of
 from .evaluate import evaluate
 from .evaluate_leave_out import estimate_without, leave_out_names
+from .evaluate_sensitivity import sensitivities
 from .measurement_level import Run, draw
 from .measurement_level_scenario import Scenario
 
@@ -31,16 +32,25 @@ class RunOrder:
     """A scenario of that level, as data."""
     leave_out: bool = False
     decisions: bool = False
+    sensitivity: bool = False
 
 
 def run(order: RunOrder) -> Row:
     """One run. What the input cannot give is a row with its reason; a defect raises."""
     if order.level == "pixels":
         return run_pixels(order.number, order.scenario)
-    return run_measurements(order.number, Scenario.model_validate(order.scenario), order.leave_out, order.decisions)
+    return run_measurements(
+        order.number,
+        Scenario.model_validate(order.scenario),
+        order.leave_out,
+        order.decisions,
+        order.sensitivity,
+    )
 
 
-def run_measurements(number: int, scenario: Scenario, leave_out: bool = False, decisions: bool = False) -> Row:
+def run_measurements(
+    number: int, scenario: Scenario, leave_out: bool = False, decisions: bool = False, sensitivity: bool = False
+) -> Row:
     """One run at measurement level."""
     drawn = draw(scenario, number)
     begin = time.perf_counter()
@@ -55,6 +65,11 @@ def run_measurements(number: int, scenario: Scenario, leave_out: bool = False, d
         row["leave_out"] = {name: _without(drawn, name) for name in leave_out_names()}
     if decisions:
         row["decisions"] = decisions_of(drawn, result, scenario, number)
+    if sensitivity:
+        row["sensitivity"] = [
+            {"input": f"{one.input} by {one.step:g} {one.unit}", "moved_m": float(np.linalg.norm(one.moved_b_m))}
+            for one in sensitivities(drawn)
+        ]
     return row
 
 

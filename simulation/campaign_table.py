@@ -6,7 +6,7 @@ import importlib.util
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -65,6 +65,11 @@ class CampaignTable:
     events: dict[str, int]
     mean_seconds: float
     decisions: tuple[Decisions, ...] = ()
+    streaming_sigma: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """The running estimate at the end against the batch optimum of the same factors, in sigmas of the latter, by kind
+    of variable: mean and worst run."""
+    sensitivity_m: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """How far the points move for an input error: mean and worst."""
 
 
 def tabulate(rows: Sequence[Row]) -> CampaignTable:
@@ -98,6 +103,10 @@ def tabulate(rows: Sequence[Row]) -> CampaignTable:
         events=dict(Counter(kind for row in good for kind in set(row["events"]))),
         mean_seconds=float(np.mean([row.get("seconds", np.nan) for row in good])) if good else float("nan"),
         decisions=summarise_decisions(good),
+        streaming_sigma=_mean_and_worst([row.get("streaming_difference_sigma", {}) for row in good]),
+        sensitivity_m=_mean_and_worst(
+            [{one["input"]: one["moved_m"]} for row in good for one in row.get("sensitivity", ())]
+        ),
     )
 
 
@@ -162,6 +171,12 @@ def _kinds(reasons: Sequence[str]) -> set[str]:
 def _means(values: Sequence[dict[str, float]]) -> dict[str, float]:
     names = list(dict.fromkeys(name for one in values for name in one))
     return {name: float(np.mean([one[name] for one in values if name in one])) for name in names}
+
+
+def _mean_and_worst(found: Sequence[dict[str, float]]) -> dict[str, tuple[float, float]]:
+    names = list(dict.fromkeys(name for one in found for name in one))
+    values = {name: [one[name] for one in found if name in one] for name in names}
+    return {name: (float(np.mean(values[name])), float(np.max(values[name]))) for name in names}
 
 
 def _summary_row(summary: Summary) -> dict[str, Any]:

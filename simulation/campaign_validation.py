@@ -57,6 +57,12 @@ def validation_section(table: CampaignTable) -> str:
         lines.append(f"| the paper's chain, {table.chain.count} clicks | {cells} | | | | |")
     families = ", ".join(f"{family} {value:.2f}" for family, value in table.chi2_per_dof.items())
     lines += ["", f"chi2/dof by family: {families}."]
+    if table.streaming_sigma:
+        stream = ", ".join(f"{name} {mean:.2f} ({worst:.2f})" for name, (mean, worst) in table.streaming_sigma.items())
+        lines.append(f"Streaming replay against batch at the end, sigmas, mean (worst run): {stream}.")
+    if table.sensitivity_m:
+        moved = ", ".join(f"{name}: {quantity_text(m, 'm')}" for name, (m, _) in table.sensitivity_m.items())
+        lines.append(f"Mean way that the points move for an input error: {moved}.")
     if table.left_out:
         left = ", ".join(
             f"{one.name} x {one.mean_error_ratio:.2f} (radius x {one.mean_radius_ratio:.2f}"

@@ -6,6 +6,7 @@ axes that turns the estimate into the truth.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from ..estimator.result import PoseEstimate, Result
+from ..estimator.result import MotionEstimate, PoseEstimate, Result
 from .measurement_level_truth import Truth
 
 Float = NDArray[np.float64]
-Group = Literal["point", "pose_b", "pose_f", "pose_m", "trajectory", "calibration", "pipe"]
+Group = Literal["point", "pose_b", "pose_f", "pose_m", "trajectory", "motion", "calibration", "pipe"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,7 @@ def evaluate(result: Result, truth: Truth) -> tuple[Quantity, ...]:
         *_points(result, truth.points_b_m),
         *_poses(result, truth),
         *_trajectory(result, truth),
+        *motion_quantities(result.motions, truth),
         *_calibration(result, calibration_truth(truth) | extrinsics_truth(result, truth)),
         *_pipe_radii(result, truth),
     )
@@ -94,6 +96,7 @@ def calibration_truth(truth: Truth) -> dict[str, float]:
     """Calibration states by the names and in the units of `Result.calibration`."""
     rig = truth.rig
     values: dict[str, float] = {"depth_offset": rig.depth_offset_m, "depth_scale": rig.depth_scale}
+    values |= dict(zip(("depth_ray_x", "depth_ray_y", "depth_ray_scale"), map(float, rig.depth_rays), strict=True))
     values["baseline"] = float(np.linalg.norm(rig.m_left_T_m_right[:3, 3]))
     for name, camera in rig.cameras.items():
         values |= {f"{name}.fx": camera.K[0, 0], f"{name}.fy": camera.K[1, 1]}
@@ -159,6 +162,17 @@ def _trajectory(result: Result, truth: Truth) -> list[Quantity]:
         if true is None or pose.covariance is None or pose.stamp_ns == truth.stamps_ns[0]:
             continue
         quantities.append(pose_quantity("trajectory", "o_T_m", pose.matrix, pose.covariance, true))
+    return quantities
+
+
+def motion_quantities(motions: Sequence[MotionEstimate], truth: Truth) -> list[Quantity]:
+    """What the camera did in each second against what it says it did."""
+    quantities = []
+    for motion in motions:
+        ends = [_true_mobile(stamp_ns, truth) for stamp_ns in (motion.from_ns, motion.to_ns)]
+        if ends[0] is not None and ends[1] is not None:
+            true = np.linalg.inv(ends[0]) @ ends[1]
+            quantities.append(pose_quantity("motion", "one second", motion.matrix, motion.covariance, true))
     return quantities
 
 

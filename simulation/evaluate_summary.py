@@ -75,7 +75,16 @@ def summarise(runs: Iterable[Sequence[Quantity]]) -> tuple[Summary, ...]:
         for key, values in in_run.items():
             by_name[key].append(values)
     summaries = [_summary(group, name, values) for (group, name), values in by_name.items()]
-    order = {"point": 0, "pose_b": 1, "pose_f": 2, "pose_m": 3, "trajectory": 4, "calibration": 5, "pipe": 6}
+    order = {
+        "point": 0,
+        "pose_b": 1,
+        "pose_f": 2,
+        "pose_m": 3,
+        "trajectory": 4,
+        "motion": 5,
+        "calibration": 6,
+        "pipe": 7,
+    }
     return tuple(sorted(summaries, key=lambda one: (order[one.group], one.name != "all", one.name)))
 
 

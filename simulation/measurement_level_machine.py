@@ -7,10 +7,9 @@ from ..estimator.pipes import EDGE_FLOOR_PX
 from ..factors.measurements import CloudFrame, OutlineSighting, Pick
 from ..factors.outline import outline_lines
 from .measurement_level_scene import cast, occluded
-from .measurement_level_truth import Float, invert, transform
+from .measurement_level_truth import KINECT_FOCAL_PX, Float, invert, transform
 from .measurement_level_world import World, inside, project, spoil
 
-KINECT_FOCAL_PX = 585.0
 KINECT_SIZE = (640, 480)
 MATCH_SIGMA_PX = 0.25
 """Disparity error of semi-global matching at a window's median."""
@@ -28,13 +27,15 @@ def cloud_frames(world: World) -> list[CloudFrame]:
 def _cloud_frame(world: World, stamp_ns: int, count: int, rng: np.random.Generator) -> CloudFrame:
     pixels = rng.uniform([8.0, 8.0], [KINECT_SIZE[0] - 8.0, KINECT_SIZE[1] - 8.0], (count, 2))
     centre = 0.5 * np.array(KINECT_SIZE) - 0.5
-    b_rays = np.c_[(pixels - centre) / KINECT_FOCAL_PX, np.ones(count)]
+    given_rays = np.c_[(pixels - centre) / KINECT_FOCAL_PX, np.ones(count)]
+    shift, scale = world.true.depth_rays[:2], world.true.depth_rays[2]
+    b_rays = np.c_[given_rays[:, :2] * (1.0 + scale) + shift, np.ones(count)]
     distance, w_normals, _ = cast(world.scene.w_T_b[:3, 3], b_rays @ world.scene.w_T_b[:3, :3].T, world.scene)
     normals = w_normals @ world.scene.w_T_b[:3, :3]
     normals = normals * -np.sign((normals * b_rays).sum(1, keepdims=True))
     slope = np.abs((normals * b_rays).sum(1))
     usable = np.isfinite(distance) & (distance > 0.5) & (distance < 4.0) & (slope > 0.3)
-    depth_m, b_rays, normals, slope = distance[usable], b_rays[usable], normals[usable], slope[usable]
+    depth_m, given_rays, normals, slope = distance[usable], given_rays[usable], normals[usable], slope[usable]
     sigma_z = kinect_sigma_m(depth_m)
     measured = (depth_m - world.true.depth_offset_m) / (1.0 + world.true.depth_scale)
     measured = measured + rng.normal(0.0, 1.0, len(depth_m)) * sigma_z * world.scenario.noise_factors.clouds
@@ -45,7 +46,7 @@ def _cloud_frame(world: World, stamp_ns: int, count: int, rng: np.random.Generat
     sigma_m = sigma_z * slope
     return CloudFrame(
         stamp_ns=stamp_ns,
-        points_m=b_rays * measured[:, None],
+        points_m=given_rays * measured[:, None],
         normals=normals,
         sigma_m=sigma_m,
         planarity_m=sigma_m,

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..factors.board import CORNER_PRINT_SIGMA_M, DIRECTIONS, marker_rotation
-from ..factors.calibration import ASPECT_REL
+from ..factors.calibration import ASPECT_REL, depth_ray_sigmas
 from ..factors.rig import Board, Pose, Rig
 
 Float = NDArray[np.float64]
 
+KINECT_FOCAL_PX = 585.0
 START_DISTANCE_M = 1.15
 """Of the mobile camera from the board when it first sees it."""
 
@@ -55,6 +56,8 @@ class TrueRig:
     depth_offset_m: float
     depth_scale: float
     """True depth is measured depth times (1 + scale), plus the offset."""
+    depth_rays: Float
+    """How the depth camera's rays lie beside those of its calibration: shift x, shift y [rad], scale."""
     boards: dict[str, TrueBoard]
 
 
@@ -109,6 +112,7 @@ def draw_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float, rng: n
         f_T_b=f_T_b,
         depth_offset_m=float(rng.normal(0.0, kinect.depth_offset_sigma_m)),
         depth_scale=float(rng.normal(0.0, kinect.depth_scale_sigma)),
+        depth_rays=rng.normal(0.0, depth_ray_sigmas(rig.cameras.b_depth, KINECT_FOCAL_PX)),
         boards={board.id: draw_board(board, rng, _lasting_m(rig, cameras)) for board in rig.boards},
     )
 
@@ -129,6 +133,7 @@ def nominal_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float) -> 
         f_T_b=pose(rig.mount.f_T_b),
         depth_offset_m=0.0,
         depth_scale=0.0,
+        depth_rays=np.zeros(3),
         boards={board.id: draw_board(board, None) for board in rig.boards},
     )
 

@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
 from surecut.estimator.advice_update import Joint, Predicted, Rows, measured_again
 from surecut.estimator.linear import LinearSystem
@@ -66,7 +67,7 @@ def test_a_new_variable_that_nothing_else_holds_says_nothing():
 def test_correlated_errors_keep_their_weights():
     """Two measurements of sigma 1 whose errors have twice the variance that the weights assume: mean has 1, not 1/2."""
     system, values = system_of([scalar_prior(1, 1.0), scalar_prior(1, 1.0)], [1])
-    system.inflation[:] = 2.0
+    system.root = csr_matrix(np.sqrt(2.0) * np.eye(2))
     joint = Joint.of(system, [1])
     assert joint.covariance[0, 0] == pytest.approx(1.0)
     # A third, honest one is weighed with a third: 1/9 + (2 + 2)/9.

@@ -11,6 +11,7 @@ from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
 from surecut.estimator.run import estimate
 from surecut.estimator.surfaces import lay_on_surfaces
+from surecut.estimator.view_cells import added_covariance
 from surecut.factors.rig import Board, Marker, Rig
 from surecut.simulation.campaign_estimate import estimate_run
 from surecut.simulation.measurement_level import draw
@@ -117,7 +118,7 @@ def test_knock_while_the_board_is_in_view():
     assert_only(result, "board_knocked")
     (event,) = told(result, "board_knocked")
     assert event.values["before_ns"] - run.truth.stamps_ns[0] < 2e9 <= event.stamp_ns - run.truth.stamps_ns[0]
-    assert event.stamp_ns - event.values["before_ns"] < 1e9
+    assert event.stamp_ns - event.values["before_ns"] <= 1e9  # keyframes at rest are a second apart
     assert abs(event.values["moved_m"] - np.hypot(0.02, 0.01)) < 3 * event.values["moved_sigma_m"]
     assert abs(event.values["turned_rad"] - 0.06) < 3 * event.values["turned_sigma_rad"]
     assert "mount (f_T_b) holds for the time before only" in event.text
@@ -253,3 +254,34 @@ def test_a_board_that_only_the_machine_sees_is_placed_by_it():
 
 def test_right_camera_helper_agrees_with_the_baseline():
     assert right_of(board_before(1.0))[0, 3] == pytest.approx(-0.15)
+
+
+# Views from one place -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("own", "common"), [(0.02, 0.01), (0.01, 0.03), (0.1, 0.001)])
+def test_views_from_one_place_add_up_to_what_their_mean_knows(own, common):
+    """n views with own part s and common part c: the mean has the variance c^2 + s^2 / n, in closed form."""
+    s2, c2 = own**2, common**2
+    total = np.tile((s2 + c2) * np.eye(2), (4, 1, 1))
+    added = [added_covariance(total, common, n) for n in range(1, 9)]
+    for n, covariance in enumerate(added, start=1):
+        closed = (s2 + n * c2) * (s2 + (n - 1) * c2) / s2
+        np.testing.assert_allclose(covariance, np.tile(closed * np.eye(2), (4, 1, 1)), rtol=1e-9)
+        information = sum(1.0 / a[0, 0, 0] for a in added[:n])
+        assert 1.0 / information == pytest.approx(c2 + s2 / n, rel=1e-9)
+
+
+def test_oblique_covariances_of_views_add_up_too():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(4, 2, 2))
+    total = A @ A.transpose(0, 2, 1) * 1e-4 + 4e-4 * np.eye(2)
+    S, C = total - 1e-4 * np.eye(2), 1e-4 * np.eye(2)
+    information = sum(np.linalg.inv(added_covariance(total, 0.01, n)) for n in range(1, 7))
+    np.testing.assert_allclose(np.linalg.inv(information), S / 6 + C, rtol=1e-9)
+
+
+def test_a_common_part_that_is_nearly_all_leaves_the_view_a_tenth():
+    total = 1e-4 * np.eye(2)[None]
+    np.testing.assert_allclose(added_covariance(total, 0.01, 1), total)
+    np.testing.assert_allclose(added_covariance(total, 0.01, 2), 1.9 * total / 0.1 * 1.0, rtol=1e-9)

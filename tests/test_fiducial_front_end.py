@@ -136,3 +136,44 @@ def test_messages_that_cannot_be_used_are_told():
         "stands in the image more than once",
         "stands in the image more than once",
     ]
+
+
+def test_followed_markers_have_the_corners_of_read_ones(monkeypatch):
+    board, other = a4_board(), a4_board()
+    following = MarkerFrontEnd(Rig(boards=(board,)), LENS, "m_left")
+    searched = []
+    find = following._search.find
+    monkeypatch.setattr(following._search, "find", lambda grey: searched.append(1) or find(grey))
+    for k in range(8):
+        at = pose(20.0, 30.0 + k, 5.0 - k, [0.02 * k - 0.08, 0.005 * k, 0.6 + 0.01 * k])
+        image = picture(board, at, seed=k)
+        followed = {s.marker: s for s in following.process(k, image)[0]}
+        read = {s.marker: s for s in MarkerFrontEnd(Rig(boards=(other,)), LENS, "m_left").process(k, image)[0]}
+        assert followed.keys() == read.keys()
+        for marker, s in followed.items():
+            covariance = s.covariance_px2 + read[marker].covariance_px2
+            apart = s.corners_px - read[marker].corners_px
+            assert (np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart) < 9.2).all()
+    assert len(searched) == 1
+
+
+def test_a_marker_that_another_took_the_place_of_is_not_followed():
+    board = a4_board(ids=(0, 1, 2, 3))
+    swapped = a4_board(ids=(0, 1, 7, 3))
+    front_end = MarkerFrontEnd(Rig(boards=(board,)), LENS, "m_left")
+    for k in range(3):
+        assert {s.marker for s in front_end.process(k, picture(board, seed=k))[0]} == {0, 1, 2, 3}
+    sightings, rejections = front_end.process(3, picture(swapped, seed=3))
+    assert {s.marker for s in sightings} == {0, 1, 3}
+    assert [r.value for r in rejections] == [1.0]
+
+
+def test_through_a_lens_that_bends_lines_markers_are_followed_too():
+    lens, board = camera(240, 180, 180, "plumb_bob", (-0.25, 0.08, 0.001, -0.001, 0.0)), a4_board()
+    front_end = MarkerFrontEnd(Rig(boards=(board,)), lens, "m_left")
+    for k in range(4):
+        at = pose(25.0, 30.0, 10.0, [-0.1 + 0.03 * k, 0.03, 0.55])
+        sightings = front_end.process(k, picture(board, at, lens, seed=k, supersampling=3))[0]
+        assert len(sightings) == 4
+        for s in sightings:
+            assert np.abs(s.corners_px - project(lens, at, marker_corners(board)[s.marker])).max() < 0.15

@@ -11,6 +11,7 @@ from realdata import real_data
 from surecut.factors.camera import CameraModel
 from surecut.factors.rig import Board, Marker, Rig
 from surecut.frontends.board_pose import board_pose_candidates
+from surecut.frontends.fiducials import pixel_choice
 from surecut.frontends.fiducials.detector import MarkerFrontEnd
 
 TO_OPENCV = [3, 2, 1, 0]
@@ -60,9 +61,36 @@ def test_golden_corners_of_opencv(name):
     assert 0.2 < inset < 1.0
     rest = np.concatenate([d - inset * outward(given[k]) for k, d in apart.items()])
     # the grid is drawn with hard pixel edges and acute corners, which a contour cuts off further
-    assert np.abs(rest).max() < (1.5 if name == "gboriginal.png" else 1.0)
-    assert np.mean(np.abs(rest) < 1.0) > 0.95
+    assert np.abs(rest).max() < (1.8 if name == "gboriginal.png" else 1.2)
+    assert np.mean(np.abs(rest) < 1.0) > (0.95 if name == "gboriginal.png" else 0.98)
     assert np.sqrt((rest**2).mean()) < 0.5
+
+
+def test_halves_of_the_pixels_agree_within_their_covariances(monkeypatch):
+    """Real noise, JPEG, careless resizing: corners from either half of a marker's pixels share nothing of it."""
+    folder, golden = photographs()
+    whole = pixel_choice._distinct
+    given = yaml.safe_load((folder / "ubiquity" / "camera.yaml").read_text())
+    lens = camera(1280, 960, given["K"], given["distortion_model"], given["D"])
+    cases = [(f"opencv/img_0{k}.jpg", "DICT_6X6_250", range(17), None) for k in range(4)]
+    cases += [("opencv/singlemarkersoriginal.jpg", "DICT_6X6_250", range(250), None)]
+    cases += [
+        (f"ubiquity/{n}", given["dictionary"], e["marker_ids"], lens) for n, e in golden["ubiquity"]["images"].items()
+    ]
+    cases += [(f"turntable/{e['file']}", "tag36h11", [76], None) for e in golden["turntable"]["images"]]
+    squares = []
+    for name, dictionary, ids, model in cases:
+        image, halves = cv2.imread(str(folder / name)), []
+        for half in (0, 1):
+            monkeypatch.setattr(pixel_choice, "_distinct", lambda *a, half=half: [c[half::2] for c in whole(*a)])
+            model = model or camera(image.shape[1], image.shape[0])
+            halves.append({s.marker: s for s in look(image, dictionary, ids, model)[0]})
+        for marker in halves[0].keys() & halves[1].keys():
+            one, other = (half[marker] for half in halves)
+            apart, covariance = one.corners_px - other.corners_px, one.covariance_px2 + other.covariance_px2
+            squares.append(np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart).mean() / 2)
+    assert len(squares) > 75
+    assert 0.6 < np.mean(squares) < 1.6
 
 
 def test_ubiquity_corners_and_reference_pose():

@@ -10,11 +10,15 @@ import time
 
 import logmaker
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from live_helpers import Collector, free_port, tcp_server, wait_for
 
 from surecut.factors.errors import LogError
+from surecut.io.damage import Damage
 from surecut.io.live.admission import Limits
 from surecut.io.live.mcap_stream import McapStream, tcp_target
+from surecut.io.records import RecordStream, Untrusted
 
 
 def recording(moments: int = 5, chunk_size: int | None = None) -> bytes:
@@ -97,7 +101,8 @@ def test_a_server_that_comes_later_is_found():
 
 
 def test_a_server_that_says_nothing_does_not_hold_up_the_end():
-    with tcp_server(lambda c, _: time.sleep(3)) as port:
+    hold = threading.Event()
+    with tcp_server(lambda c, _: hold.wait(10)) as port:
         source = McapStream(f"tcp://127.0.0.1:{port}")
         source.start(Collector())
         wait_for(source.connected)
@@ -105,6 +110,7 @@ def test_a_server_that_says_nothing_does_not_hold_up_the_end():
         source.stop()
         assert time.monotonic() - begun < 1.5
         assert source.ended()
+        hold.set()
 
 
 @pytest.mark.parametrize("chunk_size", [None, 30_000])
@@ -148,14 +154,16 @@ def test_a_message_of_100_mb_is_passed_over_and_the_stream_goes_on():
         for _ in range(100):
             connection.sendall(piece)
         connection.sendall(data[len(header) :])
-        time.sleep(2)
+        hold.wait(10)
 
+    hold = threading.Event()
     found = Collector()
     with tcp_server(serve) as port:
         source = McapStream(f"tcp://127.0.0.1:{port}", limits=Limits(message_bytes=8 << 20))
         source.start(found)
         wait_for(lambda: found.topics()["/picks"] >= 1)
         source.stop()
+        hold.set()
     assert source.counters()["oversized"] == 1
     assert source.counters().get("reconnects", 0) == 0
 
@@ -173,6 +181,27 @@ print(len(found), source.counters())
 """
     done = subprocess.run([sys.executable, "-c", code], input=recording(), capture_output=True, timeout=60, check=True)
     assert done.stdout.split()[0] == b"70"
+
+
+SMALL = {chunk_size: recording(1, chunk_size) for chunk_size in (None, 20_000)}
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    st.sampled_from([None, 20_000]),
+    st.lists(st.tuples(st.integers(8, 1 << 24), st.binary(min_size=1, max_size=12)), min_size=1, max_size=6),
+    st.booleans(),
+)
+def test_any_damage_to_a_stream_is_survived(chunk_size, writes, untrusted_network):
+    data = bytearray(SMALL[chunk_size])
+    for at, value in writes:
+        start = 8 + at % (len(data) - 8)
+        data[start : start + len(value)] = value
+    flaws: list[Damage] = []
+    rules = Untrusted(1 << 20, flaws.append, resynchronise=untrusted_network)
+    for record in RecordStream(io.BytesIO(bytes(data)), "x", with_crc=False, untrusted=rules):
+        assert record is not None
+    assert all(isinstance(flaw.reason, str) for flaw in flaws)
 
 
 @pytest.mark.parametrize("address", ["tcp://:1", "tcp://host", "udp://a:1", "", "tcp://a:99999", "tcp://[::1"])

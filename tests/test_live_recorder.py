@@ -157,6 +157,27 @@ def test_a_full_disk_is_counted_and_recording_goes_on_when_there_is_room(tmp_pat
     assert counters["sent"] + counters["dropped"] == counters["published"] + counters["images"]
 
 
+def test_a_long_recording_is_ended_and_goes_on_in_the_next_part(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    rig = ("rig.yaml", "application/yaml", b"version: 1")
+    recorder = Recorder(path, flush_s=0.02, part_s=0.1, attachments=(rig,))
+    recorder.start()
+    number = 0
+    while not (tmp_path / "run-2.mcap").exists():
+        recorder.publish(update(number))
+        number += 1
+        time.sleep(0.01)
+    recorder.stop()
+    found: list[int] = []
+    for part in sorted(tmp_path.glob("*.mcap"), key=lambda p: (len(p.name), p.name)):
+        with LogReader(part) as reader:
+            assert reader.attachment("rig.yaml") == b"version: 1"
+            found += [message.stamp_ns for message in reader if message.topic == "/estimate/points"]
+            assert reader.warnings == []
+    assert found == [update(n).stamp_ns for n in range(number)]
+    assert recorder.counters() == {"published": number, "sent": number}
+
+
 def test_nothing_is_overwritten(tmp_path: Path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"dear")

@@ -114,7 +114,7 @@ def test_cloud_points_lie_on_their_surface_once_the_depth_is_corrected(runs):
         planes = {}
         for cloud in of(run, CloudFrame):
             rig = run.truth.rig
-            points = corrected(cloud.points_m, rig.depth_offset_m, rig.depth_scale)
+            points = corrected(cloud.points_m, rig.depth_offset_m, rig.depth_scale, rig.depth_rays)
             for point, normal, sigma in zip(points, cloud.normals, cloud.sigma_m, strict=True):
                 planes.setdefault(tuple(np.round(normal, 6)), []).append((normal @ point, sigma))
         for samples in planes.values():

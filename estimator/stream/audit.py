@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
 from ..consistency import family_tests, judge, prior_tests
@@ -41,8 +42,10 @@ def audit(engine: Engine) -> Audit:
     values = relinearised(log.graph(), engine.solver.values())
     at = with_correlated_tracks(linearise(log, (), values, engine.rig.gates.robust_sigma), ODOMETRY)
     system = at.system
-    earlier = np.array([record.family == FAMILY for _, _, record in at.active])
-    system.inflation[np.repeat(earlier, system.rows)] = at.inflation
+    if system.root is not None:
+        earlier = np.array([record.family == FAMILY for _, _, record in at.active])
+        wider = np.where(np.repeat(earlier, system.rows), np.sqrt(at.inflation), 1.0)
+        system.root = csr_matrix(diags(wider) @ system.root)
     families = tuple(f for f in family_tests(at) if f.family != FAMILY)
     consistency = judge(families, prior_tests(at.active, system, TESTED), {})
     widening = {}
@@ -51,8 +54,8 @@ def audit(engine: Engine) -> Audit:
             if point.known:
                 _, blocks = point_blocks(values, keys.base(0), keys.point(point.index))
                 wide = np.trace(system.covariance(blocks))
-                system_inflation, system.inflation = system.inflation, np.ones_like(system.inflation)
+                root, system.root = system.root, None
                 plain = np.trace(system.covariance(blocks))
-                system.inflation = system_inflation
+                system.root = root
                 widening[point.id] = max(float(wide / plain), 1.0)
     return Audit(consistency, widening)

@@ -98,7 +98,7 @@ def register(
             if pairs is None:
                 return _lost(pose, config)
             step = pairs.step()
-            pose = pose @ _exp(step)
+            pose = pose @ exponential(step)
             converged = bool(np.abs(step[:3]).max() < 2e-5 and np.abs(step[3:]).max() < 2e-5)
             if converged or (reach > config.reaches_m[-1] and np.abs(step).max() < 2e-3):
                 break
@@ -216,7 +216,7 @@ def _lost(pose: Float, config: RegistrationConfig) -> Registration:
     return Registration(pose, free, 0.0, float("inf"), 0.0, np.eye(6)[0], False)
 
 
-def _exp(xi: Float) -> Float:
+def exponential(xi: Float) -> Float:
     """SE(3) exponential, rotation first."""
     angle = float(np.linalg.norm(xi[:3]))
     out = np.eye(4)

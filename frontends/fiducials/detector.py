@@ -1,6 +1,6 @@
 """The marker front end of one camera: images in, corners with covariances out, at video rate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,18 +12,22 @@ from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort, undistorted_grid
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
-from .pattern_fit import PatternFit, fit_patterns
-from .pixel_choice import Window, surroundings
+from .pattern_fit import PatternFit, Warm, fit_patterns
 from .search import Candidate, MarkerSearch
+from .tracking import Followed, MarkerFlow
 
 Float = NDArray[np.float64]
 
 CORNER_FLOOR_PX = 0.004
 """What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
+COMMON_PX = 0.01
+"""Error that two images from one place have in common, in rendered images of all sizes (docs/corners.md)."""
 _MIN_CORRELATION = 0.80
 """Pixels with the fitted pattern, for a marker that was read."""
 _MIN_CORRELATION_PREDICTED = 0.90
 """The same for one that was only expected there."""
+_MAX_CORRELATION_LOSS = 0.05
+"""From one image to the next, for a marker that is followed and not read again."""
 _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
@@ -42,6 +46,9 @@ class _Fitted:
     covariance: Float
     correlation: float
     contrast: float
+    structure: float
+    """Share of the covariance that is not the pixels' noise."""
+    warm: Warm
     problem: tuple[str, float, float] | None
     """Reason, value and limit of a refusal."""
 
@@ -49,8 +56,9 @@ class _Fitted:
 class MarkerFrontEnd:
     """Finds the rig's markers in the images of one camera.
 
-    Keeps where the boards were last, looks there first, and at the whole image in a slower rhythm or when something is
-    missing. Markers that were not read although their board was are looked for where they must be.
+    Follows the markers of the last image; looks where the boards were last when one of them is in doubt, and at the
+    whole image in a slower rhythm or when something is missing. Markers that were not read although their board was are
+    looked for where they must be.
     """
 
     def __init__(self, rig: Rig, camera: CameraModel, camera_name: CameraName) -> None:
@@ -72,6 +80,7 @@ class MarkerFrontEnd:
                 if marker.id < dictionary.size:
                     self._patterns[dictionary.name, marker.id] = dictionary.pattern(marker.id)
         self._search = MarkerSearch(tuple(self._dictionaries.values()))
+        self._flow = MarkerFlow()
         self._positions: Float | None = None
         if not _is_pinhole(camera):
             self._positions = undistorted_grid(camera)
@@ -85,6 +94,49 @@ class MarkerFrontEnd:
         """
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         grey = np.ascontiguousarray(grey, np.uint8)
+        good = self._followed(grey)
+        rejections: list[Rejection] = []
+        if good is None:
+            good, rejections = self._searched(stamp_ns, grey)
+        good += self._expected(grey, good)
+        sightings = [self._sighting(stamp_ns, f) for f in good]
+        self._search.remember([s.raw_px for s in sightings], grey.shape)
+        followed = zip(good, sightings, strict=True)
+        self._flow.remember(
+            grey.copy() if grey is image else grey,
+            [Followed(*f.candidate.key, s.raw_px, f.correlation, f.warm) for f, s in followed],
+        )
+        return sightings, rejections
+
+    def _followed(self, grey: NDArray[np.uint8]) -> list[_Fitted] | None:
+        """The markers of the last image, all of them, where their corners have gone; None when any is in doubt."""
+        if self._search.due():
+            return None
+        raw = self._flow.follow(grey)
+        if raw is None:
+            return None
+        before = self._flow.markers
+        result: list[_Fitted] = []
+        for cells in sorted({self._dictionaries[m.dictionary].cells for m in before}):
+            index = [k for k, m in enumerate(before) if self._dictionaries[m.dictionary].cells == cells]
+            ideal = undistort(self._camera, raw[index])[0]
+            if not np.isfinite(ideal).all():
+                return None
+            group = [before[k] for k in index]
+            candidates = [Candidate(m.dictionary, m.marker, c) for m, c in zip(group, ideal, strict=True)]
+            patterns = [self._patterns[c.key] for c in candidates]
+            warm = Warm.together([m.warm for m in group])
+            fit = fit_patterns(grey, ideal, patterns, self._positions, raw[index], warm)
+            for k, m in enumerate(group):
+                limit = max(_MIN_CORRELATION, m.correlation - _MAX_CORRELATION_LOSS)
+                result.append(_judged(candidates[k], ideal[k], fit, k, cells, limit))
+        if any(f.problem is not None for f in result):
+            return None
+        self._search.passed()
+        return result
+
+    def _searched(self, stamp_ns: int, grey: NDArray[np.uint8]) -> tuple[list[_Fitted], list[Rejection]]:
+        """Markers that are read in the image, and what was refused."""
         found = self._search.find(grey)
         known = [c for c in found if (c.dictionary, c.marker) in self._patterns]
         unknown = [c for c in found if (c.dictionary, c.marker) not in self._patterns]
@@ -92,11 +144,7 @@ class MarkerFrontEnd:
         fitted = self._fit(grey, known, _MIN_CORRELATION)
         good, refused = self._one_per_marker([f for f in fitted if f.problem is None])
         refused += [f for f in fitted if f.problem is not None]
-        good += self._expected(grey, good)
-        rejections += [self._rejection(stamp_ns, f) for f in refused]
-        sightings = [self._sighting(stamp_ns, f) for f in good]
-        self._search.remember([s.raw_px for s in sightings], grey.shape)
-        return sightings, rejections
+        return good, [*rejections, *(self._rejection(stamp_ns, f) for f in refused)]
 
     def _expected(self, grey: NDArray[np.uint8], good: list[_Fitted]) -> list[_Fitted]:
         """Markers of the boards in view that were not read, where they fit the image."""
@@ -127,19 +175,10 @@ class MarkerFrontEnd:
             group, starts = [group[k] for k in keep], starts[keep]
             if group:
                 patterns = [self._patterns[c.key] for c in group]
-                fit = fit_patterns(grey, starts, patterns, self._positions, self._windows(starts, cells, grey.shape))
+                raw = None if self._positions is None else distort(self._camera, starts)
+                fit = fit_patterns(grey, starts, patterns, self._positions, raw)
                 result += [_judged(c, starts[k], fit, k, cells, min_correlation) for k, c in enumerate(group)]
         return result
-
-    def _windows(self, ideal: Float, cells: int, shape: tuple[int, ...]) -> list[Window] | None:
-        """Where to find the pixels of markers in an image that the lens has bent."""
-        if self._positions is None:
-            return None
-        middles = (ideal + np.roll(ideal, 1, axis=1)) / 2
-        outline = distort(self._camera, np.concatenate([ideal, middles], axis=1))
-        boxes = np.stack([np.nanmin(outline, axis=1), np.nanmax(outline, axis=1)], 1)[:, [0, 0, 1, 1]]
-        boxes[:, 1, 1], boxes[:, 3, 1] = boxes[:, 2, 1], boxes[:, 0, 1]
-        return [surroundings(box, cells, (shape[1], shape[0])) for box in boxes]
 
     def _ours(self, candidate: Candidate, ideal: bool) -> Float:
         if ideal:
@@ -184,6 +223,7 @@ class MarkerFrontEnd:
             fitted.corners,
             blocks + CORNER_FLOOR_PX**2 * np.eye(2),
             distort(self._camera, fitted.corners),
+            float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2 + COMMON_PX**2)),
         )
 
     def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:
@@ -224,18 +264,12 @@ def _judged(candidate: Candidate, start: Float, fit: PatternFit, k: int, cells: 
         problem = ("the fit did not settle, last step in px", float(fit.last_step_px[k]), _SETTLED_PX)
     elif moved > 1.5:
         problem = ("the fit left the marker, move in cells", moved, 1.5)
-    return _Fitted(candidate, corners, covariance, float(fit.correlation[k]), float(fit.contrast[k]), problem)
+    correlation, contrast, structure = (float(x[k]) for x in (fit.correlation, fit.contrast, fit.structure))
+    return _Fitted(candidate, corners, covariance, correlation, contrast, structure, fit.warm.of(k), problem)
 
 
 def _refused(fitted: _Fitted, reason: str, value: float, limit: float) -> _Fitted:
-    return _Fitted(
-        fitted.candidate,
-        fitted.corners,
-        fitted.covariance,
-        fitted.correlation,
-        fitted.contrast,
-        (reason, float(value), float(limit)),
-    )
+    return replace(fitted, problem=(reason, float(value), float(limit)))
 
 
 def _distinct(fitted: list[_Fitted]) -> list[_Fitted]:

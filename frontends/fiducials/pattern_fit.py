@@ -6,6 +6,7 @@ corners inwards: the blurred step is part of the model, and the edges inside the
 Pixels, not interpolated samples, are compared, so the residuals are the noise and give the covariance.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .pattern_model import PatternModel, corner_basis, homography, pattern_model, second_difference
-from .pixel_choice import Choice, Pixels, Windows, choose_pixels, surroundings
+from .pixel_choice import Choice, Pixels, choose_pixels, surroundings
+from .pixel_noise import pixel_noise
 
 # NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
 Float = NDArray[Any]
@@ -23,14 +25,15 @@ _MAX_PIXELS = 512
 """Pixels per marker; more cost time and give nothing that the model's own error does not swamp."""
 _FEW_PIXELS = 240
 """Of them, those that the first steps use."""
-_COARSE_LATTICE, _LATTICE = 3000, 9000
-"""Pixels of a marker that are looked at to choose from."""
 _COARSE_REACH_PX = 3.0
 _REACH_PX, _REACH_BLURS = 0.7, 2.2
 """Pixels farther than this from every edge of the pattern say little about the corners."""
 _BLUR_RANGE_PX = (0.25, 4.0)
 _COARSE_BLUR_PX = 0.8
 """Least blur of the first stage: with a sharper model too few of its pixels would feel the edges."""
+_START_BLUR_PX = 1.2
+_STEPS = 8
+"""Most Gauss-Newton steps of each of the two stages."""
 _STEP_PX = 1.0
 _CAUTIOUS_AFTER, _CAUTION = 3, 0.6
 """From that step on only a part of each is taken, which ends the swinging to and fro that outlying pixels can cause."""
@@ -68,7 +71,12 @@ class PatternFit:
     last_step_px: Float
     """Shape (m,), what the last step moved a corner by (part of the covariance); large where the fit did not settle."""
     noise_factor: Float
-    """Shape (m,), how much residuals that hang together raise the variance over white noise of the same size."""
+    """Shape (m,), how much the variance is raised over white noise of the same size, by residuals that hang together
+    and by such that gather where the corners are told."""
+    structure: Float
+    """Shape (m,), share of the covariance that is not the noise of the pixels but what the model does not know of
+    print, lens and light: it comes back in the next image from the same place."""
+    warm: "Warm"
 
 
 def fit_patterns(
@@ -76,9 +84,8 @@ def fit_patterns(
     corners: Float,
     patterns: list[Float],
     positions: Float | None = None,
-    windows: Windows | None = None,
-    steps: int = 8,
-    blur_px: float = 1.2,
+    raw: Float | None = None,
+    warm: "Warm | None" = None,
 ) -> PatternFit:
     """Corners of m markers with one pattern size, from near ones.
 
@@ -88,28 +95,65 @@ def fit_patterns(
         patterns: m arrays (cells, cells), see `MarkerDictionary.pattern`.
         positions: the ideal pixel of each image pixel, shape (height, width, 2), NaN beyond the lens model; None where
             the lens does not distort.
-        windows: x0, y0, x1, y1 of each marker with its surroundings in the raw image, needed with `positions`.
-        steps: most Gauss-Newton steps of each of the two stages.
-        blur_px: blur to start from.
+        raw: the corners in the image, shape (m, 4, 2), needed with `positions`.
+        warm: blur, tone and light of the same markers a moment ago. The corners are then taken to be within a pixel or
+            so, and the coarse stage is left out.
     """
-    cells = np.array([len(p) for p in patterns])
-    D = np.stack([second_difference(p) for p in patterns]).astype(np.float32)
-    lines = (np.arange(-1, cells[0] + 2) / cells[0]).astype(np.float32)
+    cells = len(patterns[0])
+    D = np.stack([second_difference(p.tobytes(), len(p)) for p in patterns])
+    lines = (np.arange(-1, cells + 2) / cells).astype(np.float32)
+    raw = corners if raw is None else raw
+    near = corners
+    if warm is None:
+        near, warm = _coarse(image, corners, raw, patterns, positions, D, lines)
+        raw = raw + near - corners
+    reach = _REACH_PX + _REACH_BLURS * np.sqrt(warm.blur[:, :2].max(1))
+    pixels = choose_pixels(image, positions, raw, near, patterns, Choice(reach, _MAX_PIXELS))
+    state = _State(near - pixels.origin[:, None], warm.blur, warm.tone, warm.light)
+    state, solved = _descend(state, pixels, D, lines, False)
     size = image.shape[1], image.shape[0]
-    around = [surroundings(c, len(p), size) for c, p in zip(corners, patterns, strict=True)]
-    windows = around if windows is None else windows
+    return _summary(state, solved, pixels, pixel_noise(image, [surroundings(c, cells, size) for c in raw]))
+
+
+def _coarse(
+    image: NDArray[np.uint8],
+    corners: Float,
+    raw: Float,
+    patterns: list[Float],
+    positions: Float | None,
+    D: Single,
+    lines: Single,
+) -> tuple[Float, "Warm"]:
+    """Corners within a fraction of a pixel, and the first blur and light."""
     m = len(corners)
-    few = Choice(np.full(m, _COARSE_REACH_PX), _COARSE_LATTICE, _FEW_PIXELS)
-    pixels = choose_pixels(image, positions, windows, corners, patterns, few)
-    blur = np.tile([blur_px**2, blur_px**2, 0.0], (m, 1))
-    start = _State(corners - pixels.origin[:, None], blur, np.zeros(m), None)
-    state, _ = _descend(start, pixels, D, lines, steps, True)
-    coarse = state.corners + pixels.origin[:, None]
-    reach = _REACH_PX + _REACH_BLURS * np.sqrt(state.blur[:, :2].max(1))
-    pixels = choose_pixels(image, positions, windows, coarse, patterns, Choice(reach, _LATTICE, _MAX_PIXELS))
-    state = _State(coarse - pixels.origin[:, None], state.blur, state.tone, state.light)
-    state, solved = _descend(state, pixels, D, lines, steps, False)
-    return _summary(state, solved, pixels)
+    pixels = choose_pixels(image, positions, raw, corners, patterns, Choice(np.full(m, _COARSE_REACH_PX), _FEW_PIXELS))
+    blur = np.tile([_START_BLUR_PX**2, _START_BLUR_PX**2, 0.0], (m, 1))
+    state = _State(corners - pixels.origin[:, None], blur, np.zeros(m), None)
+    state, _ = _descend(state, pixels, D, lines, True)
+    assert state.light is not None
+    return state.corners + pixels.origin[:, None], Warm(state.blur, state.tone, state.light)
+
+
+@dataclass(frozen=True, slots=True)
+class Warm:
+    """What a fit found beside the corners, to start the next one from."""
+
+    blur: Float
+    """Shape (m, 3)."""
+    tone: Float
+    """Shape (m,)."""
+    light: Float
+    """Shape (m, 10)."""
+
+    def of(self, k: int) -> "Warm":
+        """One marker's."""
+        return Warm(self.blur[k : k + 1], self.tone[k : k + 1], self.light[k : k + 1])
+
+    @staticmethod
+    def together(parts: Sequence["Warm"]) -> "Warm":
+        """Several markers'."""
+        blur, tone, light = (np.concatenate([getattr(p, name) for p in parts]) for name in ("blur", "tone", "light"))
+        return Warm(blur, tone, light)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,9 +178,7 @@ class _Solved:
     jacobian: Single
 
 
-def _descend(
-    state: _State, pixels: Pixels, D: Single, lines: Single, steps: int, coarse: bool
-) -> tuple[_State, _Solved]:
+def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bool) -> tuple[_State, _Solved]:
     """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for."""
     m, n = pixels.value.shape
     corners, blur, tone = state.corners.copy(), state.blur.copy(), state.tone.copy()
@@ -150,7 +192,7 @@ def _descend(
     )
     forgiven = _COARSE_FORGIVEN_PX if coarse else _FORGIVEN_PX
     active = np.arange(m)
-    for count in range(steps):
+    for count in range(_STEPS):
         lit = None if count == 0 and state.light is None else light[active]
         now = _State(corners[active], blur[active], tone[active], lit)
         one = _solve(now, pixels.of(active), D[active], lines, forgiven, coarse)
@@ -264,11 +306,11 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
     return np.sqrt(np.clip(1.0 - left / np.maximum(spread, 1e-9), 0.0, 1.0)).astype(float)
 
 
-def _summary(state: _State, solved: _Solved, pixels: Pixels) -> PatternFit:
+def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> PatternFit:
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
-    factor = _hang_together(solved, pixels, weight)
+    factor = _hang_together(solved, pixels, weight) * _gathered(solved, weight, variance)
     last_step = np.abs(solved.step[:, :8]).max(1)
     covariance = solved.inverse[:, :8, :8] * (variance * factor)[:, None, None]
     covariance += (last_step**2)[:, None, None] * np.eye(8)
@@ -282,6 +324,8 @@ def _summary(state: _State, solved: _Solved, pixels: Pixels) -> PatternFit:
         _share(solved, pixels),
         last_step,
         factor,
+        np.clip(1.0 - (noise**2 + _ROUNDING**2) / (variance * factor), 0.0, 1.0),
+        Warm(state.blur, state.tone, light),
     )
 
 
@@ -291,6 +335,18 @@ def _share(solved: _Solved, pixels: Pixels) -> Float:
     return ((strength * solved.weight).sum(1) / np.maximum(whole, 1e-9)).astype(float)
 
 
+def _gathered(solved: _Solved, weight: Single, variance: Float) -> Float:
+    """How much larger residuals are where they tell of the corners than elsewhere, shape (m,), as a variance; 1 where
+    they are not.
+
+    A picture that was made smaller without care has steps along its edges and noise nowhere else (White, "A
+    heteroskedasticity-consistent covariance matrix estimator", 1980).
+    """
+    strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian) * weight**2
+    there = (solved.residual**2 * strength).sum(1).astype(float)
+    return np.maximum(there / np.maximum(variance * strength.sum(1), 1e-12), 1.0)
+
+
 def _hang_together(solved: _Solved, pixels: Pixels, weight: Single) -> Float:
     """Variance of the sums of residuals over small blocks against that of independent ones, shape (m,).
 
@@ -298,13 +354,13 @@ def _hang_together(solved: _Solved, pixels: Pixels, weight: Single) -> Float:
     """
     m = len(weight)
     blocks = int(pixels.block.max(initial=0)) + 1
-    place = (pixels.block + blocks * np.arange(m)[:, None]).ravel()
+    place = (pixels.block + blocks * np.arange(m)[:, None]) * 8
     score = ((solved.residual * weight)[..., None] * solved.jacobian).astype(float)
     apart = (score**2).sum((1, 2))
-    together, used = np.zeros(m), np.zeros(m)
-    for k in range(8):
-        sums = np.bincount(place, score[..., k].ravel(), minlength=m * blocks).reshape(m, blocks) ** 2
-        together += sums.sum(1)
-        used = np.maximum(used, sums.sum(1) ** 2 / np.maximum((sums**2).sum(1), 1e-12))
+    sums = np.bincount((place[..., None] + np.arange(8)).ravel(), score.ravel(), minlength=m * blocks * 8)
+    sums = sums.reshape(m, blocks, 8) ** 2
+    each = sums.sum(1)
+    together = each.sum(1)
+    used = (each**2 / np.maximum((sums**2).sum(1), 1e-12)).max(1)
     factor = together / np.maximum(apart, 1e-12)
     return np.where(factor > 1.0 + 2.0 * np.sqrt(2.0 / np.maximum(used, 1.0)), factor, 1.0)

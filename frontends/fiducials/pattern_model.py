@@ -9,6 +9,7 @@ edge line k at the blur's width there, and a first-order term for grid lines tha
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -63,10 +64,11 @@ def _marker_coordinates(H: Float, xy: Single) -> tuple[Single, Single, Single, S
     return a, b, grad_a, grad_b
 
 
-def second_difference(pattern: Float) -> Float:
+@lru_cache(maxsize=4096)
+def second_difference(pattern: bytes, cells: int) -> Single:
     """Of the pattern with the white page round it, for the grid lines from one cell outside to one cell outside."""
-    extended = np.pad(pattern, 2, constant_values=1.0)
-    return np.diff(np.diff(extended, axis=0), axis=1)
+    extended = np.pad(np.frombuffer(pattern).reshape(cells, cells), 2, constant_values=1.0)
+    return np.diff(np.diff(extended, axis=0), axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)

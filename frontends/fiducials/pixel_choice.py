@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .pattern_model import UNIT, homography
+from .pattern_model import homography
 
 # NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
 Float = NDArray[Any]
@@ -17,13 +18,16 @@ Windows = Sequence[Window]
 
 _MARGIN_CELLS = 0.9
 """How far outside the border the page is taken to be white."""
+_SPARE = 2.0
+"""Places per wanted pixel: some fall on the same one."""
+_GOLDEN = 0.6180339887498949
 _BLOCK_PX, _BLOCK_PIXELS = 3, 8
 """Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pixels:
-    """Chosen pixels, m markers by n pixels, padded with weight 0; in no order of place."""
+    """Chosen pixels, m markers by n pixels, padded with weight 0."""
 
     origin: Float
     """Shape (m, 2): near the marker, taken off the positions to keep single precision fine."""
@@ -45,85 +49,99 @@ class Choice:
 
     reach_px: Float
     """Distance from an edge of the pattern, shape (m,)."""
-    lattice: int
-    """Pixels that are looked at to choose from."""
     most: int
 
 
 def choose_pixels(
     image: NDArray[np.uint8],
     positions: Float | None,
-    windows: Windows,
+    raw: Float,
     corners: Float,
     patterns: list[Float],
     choice: Choice,
 ) -> Pixels:
-    """Pixels near the edges of each marker's pattern, spread evenly.
+    """Pixels near the edges of each marker's pattern, spread evenly along them.
 
-    `positions` holds the ideal pixel of each image pixel, shape (height, width, 2); None where they are the same.
+    Args:
+        positions: the ideal pixel of each image pixel, shape (height, width, 2); None where they are the same.
+        raw: corners in the image, shape (m, 4, 2). Within a marker the lens is taken for straight here: its bend is
+            far less than the reach, and decides on nothing but which pixels are looked at.
+        corners: the same in ideal pixels.
     """
     width = image.shape[1]
     origin = corners.mean(1)
-    H = homography(corners)
-    chosen = [
-        _near_edges(H[k], patterns[k], width, positions, windows[k], choice, choice.reach_px[k])
-        for k in range(len(corners))
-    ]
-    n = max((len(c) for c in chosen), default=0)
-    m = len(corners)
-    xy, value, weight = np.zeros((m, n, 2), np.float32), np.zeros((m, n), np.float32), np.zeros((m, n), np.float32)
+    chosen = _distinct(_near_edges(raw, patterns, choice), image.shape, choice.most)
+    m, n = len(corners), max((len(c) for c in chosen), default=0)
+    index, weight = np.zeros((m, n), np.int64), np.zeros((m, n), np.float32)
     block = np.zeros((m, n), np.int64)
-    for k, index in enumerate(chosen):
-        rows, columns = np.divmod(index, width)
-        count = len(index)
-        here = np.column_stack([columns, rows]) if positions is None else positions[rows, columns]
-        xy[k, :count], value[k, :count], weight[k, :count] = here - origin[k], image[rows, columns], 1.0
+    for k, mine in enumerate(chosen):
+        count = len(mine)
         if count:
-            x0, y0, x1, y1 = windows[k]
-            size = max(_BLOCK_PX, int(np.sqrt((x1 - x0) * (y1 - y0) * _BLOCK_PIXELS / count)))
-            across = (columns - x0) // size
-            block[k, :count] = (rows - y0) // size * ((x1 - x0) // size + 1) + across
-    return Pixels(origin, xy, value, weight, block)
+            index[k, :count], index[k, count:], weight[k, :count] = mine, mine[0], 1.0
+            block[k, :count] = _blocks(mine, width)
+    flat = index.ravel()
+    value = image.reshape(-1)[flat].astype(np.float32).reshape(m, n)
+    if positions is None:
+        rows = index // width
+        xy = np.stack([index - rows * width, rows], -1)
+    else:
+        xy = positions.reshape(-1, 2)[flat].reshape(m, n, 2)
+    return Pixels(origin, (xy - origin[:, None]).astype(np.float32), value, weight, block)
 
 
-def _near_edges(
-    H: Float, pattern: Float, width: int, positions: Float | None, window: Window, choice: Choice, reach_px: float
-) -> NDArray[np.int64]:
-    """Flat indices of the pixels of one marker, in no order of place."""
-    x0, y0, x1, y1 = window
-    if x1 - x0 < 4 or y1 - y0 < 4:
-        return np.zeros(0, np.int64)
-    # every so manieth pixel: on a large marker enough to choose from; the odd step runs along no edge for long
-    step = max(1, (x1 - x0) * (y1 - y0) // choice.lattice)
-    step += (x1 - x0) % step == 0 and step > 1
-    rows, columns = np.divmod(np.arange(0, (x1 - x0) * (y1 - y0), step), x1 - x0)
-    rows, columns = rows + y0, columns + x0
-    xy = np.column_stack([columns, rows]).astype(float) if positions is None else positions[rows, columns]
-    inverse = np.linalg.inv(H)
-    r = xy @ inverse[:, :2].T + inverse[:, 2]
-    cells = len(pattern)
-    a, b = r[:, 0] / r[:, 2] * cells, r[:, 1] / r[:, 2] * cells
-    off = np.maximum(np.abs(a - cells / 2), np.abs(b - cells / 2))
-    inside = (r[:, 2] > 0) & (off < cells / 2 + _MARGIN_CELLS)
-    a, b = a[inside], b[inside]
-    corners = (H @ np.column_stack([UNIT, np.ones(4)]).T).T
-    corners = corners[:, :2] / corners[:, 2:]
-    u = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
-    v = float(np.linalg.norm(corners[3] - corners[0] + corners[2] - corners[1])) / 2
-    in_x, in_y = _edges(pattern)
-    near = _edge_within(a, b, in_x, reach_px * cells / u) | _edge_within(b, a, in_y, reach_px * cells / v)
-    index = (rows * width + columns)[inside][near]
-    scatter = (index * 2654435761) % 4294967296
-    if len(index) <= choice.most:
-        return index
-    return index[np.argpartition(scatter, choice.most)[: choice.most]]
+def _blocks(index: NDArray[np.int64], width: int) -> NDArray[np.int64]:
+    """Which of the squares that hold some pixels each the pixels of one marker (flat indices, in order) are in."""
+    rows = index // width
+    columns = index - rows * width
+    x0, y0 = int(columns.min()), int(rows[0])
+    x1, y1 = int(columns.max()) + 1, int(rows[-1]) + 1
+    size = max(_BLOCK_PX, int(np.sqrt((x1 - x0) * (y1 - y0) * _BLOCK_PIXELS / len(index))))
+    return (rows - y0) // size * ((x1 - x0) // size + 1) + (columns - x0) // size
 
 
-def _edge_within(across: Float, along: Float, edges: NDArray[np.bool_], reach_cells: float) -> NDArray[np.bool_]:
-    """Whether the grid line nearest in `across` is an edge of the pattern there, and within reach."""
-    line = np.rint(across).astype(np.intp)
-    cell = np.floor(along).astype(np.intp) + 1
-    return edges[line, cell] & (np.abs(across - line) < reach_cells)
+def _near_edges(raw: Float, patterns: list[Float], choice: Choice) -> Float:
+    """Places on both sides of the edges of each marker, shape (m, n, 2), in the image."""
+    H = homography(raw)
+    samples = np.stack([_samples(p.tobytes(), len(p), round(_SPARE * choice.most)) for p in patterns])
+    place, across, aside = samples[..., :2], samples[..., 2:4], samples[..., 4:]
+    u = np.linalg.norm(raw[:, 1] - raw[:, 0] + raw[:, 2] - raw[:, 3], axis=1) / 2
+    v = np.linalg.norm(raw[:, 3] - raw[:, 0] + raw[:, 2] - raw[:, 1], axis=1) / 2
+    cell = 1.0 / np.array([len(p) for p in patterns])
+    reach = np.minimum(choice.reach_px[:, None] / np.stack([u, v], -1), _MARGIN_CELLS * cell[:, None])
+    ab = place + across * (aside * reach[:, None])
+    q = ab @ H[:, :, :2].transpose(0, 2, 1) + H[:, None, :, 2]
+    return q[..., :2] / np.where(q[..., 2:] > 0, q[..., 2:], np.nan)
+
+
+@lru_cache(maxsize=4096)
+def _samples(pattern: bytes, cells: int, count: int) -> Float:
+    """Points along the edges of a pattern: place (2) in the unit square, unit vector across (2), and how far (1) in
+    units of the reach, -1 to 1. Shape (count, 5). Evenly spread by the golden ratio (a Kronecker sequence)."""
+    across_x, across_y = _edges(np.frombuffer(pattern).reshape(cells, cells))
+    pieces = [(line, along - 1, 1.0, 0.0) for line, along in np.argwhere(across_x)]
+    pieces += [(along - 1, line, 0.0, 1.0) for line, along in np.argwhere(across_y)]
+    edge = np.array(pieces, float)
+    k = np.arange(count)
+    at = (k + 0.5) / count * len(edge)
+    piece = np.minimum(at.astype(int), len(edge) - 1)
+    result = np.empty((count, 5))
+    result[:, 2:4] = edge[piece, 2:]
+    result[:, :2] = (edge[piece, :2] + (at - piece)[:, None] * result[:, 3:1:-1]) / cells
+    result[:, 4] = 2.0 * (k * _GOLDEN % 1.0) - 1.0
+    return result
+
+
+def _distinct(places: Float, shape: tuple[int, ...], most: int) -> list[NDArray[np.int64]]:
+    """Flat indices of the pixels that places (m, n, 2) fall on, in order, each once, in the image, not too many."""
+    height, width = shape[:2]
+    near = np.rint(places)
+    inside = (near[..., 0] >= 0) & (near[..., 1] >= 0) & (near[..., 0] < width) & (near[..., 1] < height)
+    flat = np.where(inside, near[..., 1] * width + near[..., 0], -1.0).astype(np.int64)
+    flat.sort(axis=1)
+    first = flat >= 0
+    first[:, 1:] &= flat[:, 1:] != flat[:, :-1]
+    chosen = [row[keep] for row, keep in zip(flat, first, strict=True)]
+    return [c if len(c) <= most else c[np.linspace(0, len(c) - 1, most).astype(np.int64)] for c in chosen]
 
 
 def _edges(pattern: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -45,6 +45,14 @@ class MarkerSearch:
         self._since_full = 0
         self._blank = 0
 
+    def due(self) -> bool:
+        """Is it time to look at the whole image again?"""
+        return self._window is None or self._since_full + 1 >= _FULL_EVERY
+
+    def passed(self) -> None:
+        """One more image in which nothing had to be looked for."""
+        self._since_full += 1
+
     def find(self, grey: NDArray[np.uint8]) -> list[Candidate]:
         """Markers in a grey image, of any id."""
         height, width = grey.shape

@@ -17,8 +17,8 @@ from .segment import cylinder_sighting
 
 Float = NDArray[np.float64]
 
-LEAST_REACH_M = 0.03
-"""The search goes so far beyond the predicted surface at least."""
+LEAST_REACH_M = 0.06
+"""The search goes so far beyond the predicted surface at least: a mount that is off has to show, not to hide."""
 GATE_SIGMA = 3.0
 _FIRST, _SECOND = 1000, 2500
 """Points for the place, and for the fit that is kept: more cost time and change nothing."""

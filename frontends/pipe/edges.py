@@ -152,12 +152,12 @@ def _refined(
         return None
     row, where = np.array(places).T
     along = (row + 0.5) * _STRETCH - _HALF_LENGTH
-    slope, shift = np.polyfit(along, where, 1)
+    slope, shift = _straight(along, where)
     for _ in range(2):
         off = np.abs(where - slope * along - shift)
         keep = off <= max(2.5 * float(np.median(off)), 0.4)
         if keep.sum() >= 2:
-            slope, shift = np.polyfit(along[keep], where[keep], 1)
+            slope, shift = _straight(along[keep], where[keep])
     turn = float(np.arctan(slope))
     # x = shift + slope s: the normal turns by -turn (along is (-sin, cos)).
     angle, rho = theta - turn, float(shift * np.cos(turn))
@@ -167,6 +167,13 @@ def _refined(
     sign = 1 if wraps % 2 == 0 else -1
     span = (float(start + move), float(end + move))
     return EdgeLine(angle - wraps * np.pi, sign * rho, span if sign > 0 else (-span[1], -span[0]), evidence)
+
+
+def _straight(x: Float, y: Float) -> tuple[float, float]:
+    """Slope and offset of the least squares line."""
+    middle = x.mean()
+    slope = float((x - middle) @ y / ((x - middle) @ (x - middle)))
+    return slope, float(y.mean() - slope * middle)
 
 
 def _same(a: EdgeLine, b: EdgeLine) -> bool:

@@ -80,7 +80,8 @@ def fit_edges(grey: Float, px: Float, seeds: Sequence[EdgeSeed], noise: float) -
     state, good = _converged(pixels)
     for n, i in enumerate(whole):
         if good[2 * n] and good[2 * n + 1]:
-            fits[i] = _result(seeds[i], pixels.only(2 * n), state.one(2 * n), state.one(2 * n + 1))
+            wide, narrow = (np.arange(len(good)) == 2 * n + k for k in (0, 1))
+            fits[i] = _result(seeds[i], pixels.only(wide), state.only(wide), state.only(narrow))
     return fits
 
 
@@ -101,7 +102,7 @@ def _converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
         moving &= good
         if not moving.any():
             break
-        proposal = linearised(pixels, trial)
+        proposal = linear.renewed(pixels, trial, moving)
         gain = pixels.summed(weights / linear.variance * (linear.squares - proposal.squares))
         gain += (state.deviation() ** 2 - trial.deviation() ** 2) @ prior
         better = moving & (gain >= 0)

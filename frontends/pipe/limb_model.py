@@ -42,9 +42,8 @@ class EdgeStates:
         offset = self.offset + np.clip(step[:, 0], -0.7, 0.7)
         return EdgeStates(offset, self.turn + np.clip(step[:, 1], -0.03, 0.03), log_blur, self.shading + step[:, 3:])
 
-    def one(self, edge: int) -> "EdgeStates":
-        part = slice(edge, edge + 1)
-        return EdgeStates(self.offset[part], self.turn[part], self.log_blur[part], self.shading[part])
+    def only(self, edges: NDArray[np.bool_]) -> "EdgeStates":
+        return EdgeStates(self.offset[edges], self.turn[edges], self.log_blur[edges], self.shading[edges])
 
     def where(self, taken: NDArray[np.bool_], other: "EdgeStates") -> "EdgeStates":
         """This state for the edges that are taken, the other's for the rest."""
@@ -88,11 +87,12 @@ class EdgePixels:
         """Per edge, (stretches, ...) to (edges, ...)."""
         return np.add.reduceat(values, self.starts, axis=0)
 
-    def only(self, edge: int) -> "EdgePixels":
-        keep = self.edge == edge
+    def only(self, edges: NDArray[np.bool_]) -> "EdgePixels":
+        """The pixels of some edges, (edges,), which are numbered anew."""
+        keep = edges[self.edge]
         grey, depth, along, weight = (t[keep] for t in (self.grey, self.depth, self.along, self.weight))
-        of_one = np.zeros(len(grey), np.int64)
-        return EdgePixels(grey, depth, along, weight, self.half_width[keep], self.evenness[keep], of_one, self.noise)
+        number = (np.cumsum(edges) - 1)[self.edge[keep]]
+        return EdgePixels(grey, depth, along, weight, self.half_width[keep], self.evenness[keep], number, self.noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,18 @@ class EdgeModel:
     squares: Float
     """(stretches,), sum of squared residuals."""
     variance: Float
+
+    def renewed(self, pixels: EdgePixels, state: EdgeStates, edges: NDArray[np.bool_]) -> "EdgeModel":
+        """The model at another state for some edges; the others' stays."""
+        if edges.all():
+            return linearised(pixels, state)
+        rows, part = edges[pixels.edge], linearised(pixels.only(edges), state.only(edges))
+        tables = []
+        for name in ("jacobian", "residual", "shift", "shift_sigma", "squares", "variance"):
+            table = getattr(self, name).copy()
+            table[rows] = getattr(part, name)
+            tables.append(table)
+        return EdgeModel(*tables)
 
     def where(self, taken: NDArray[np.bool_], other: "EdgeModel") -> "EdgeModel":
         """This model for the stretches that are taken, the other's for the rest."""
@@ -136,13 +148,13 @@ _LIMB_SLOPE = np.gradient(_LIMB_Y, _LIMB_X)
 
 
 def linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
+    """Model and derivatives of all edges at a state."""
     edge = pixels.edge
     blur = np.exp(state.log_blur)[edge, None]
     tau = pixels.depth + state.offset[edge, None] - state.turn[edge, None] * pixels.along
     x = tau / blur
-    step = ndtr(x)
-    bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    shading, by_depth, by_width = _shading(tau, pixels.along, blur, pixels.half_width[:, None])
+    step, bell = ndtr(x), _bell(x)
+    shading, by_depth, by_width = _shading(tau, x, step, bell, pixels.along, blur, pixels.half_width[:, None])
     coefficients = state.shading[edge, :, None]
     ramp = -tau * (1 - step) + blur * bell
     basis = np.stack((1 - step, ramp, step), axis=2) * pixels.weight[..., None]
@@ -169,28 +181,34 @@ def linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     return EdgeModel(jacobian, residual, shift, np.sqrt(variance / strength), squares, variance)
 
 
-def _shading(tau: Float, along: Float, blur: Float, half_width: Float) -> tuple[Float, Float, Float]:
+def _bell(x: Float) -> Float:
+    return np.exp(-0.5 * x**2) * (1 / np.sqrt(2 * np.pi))
+
+
+def _shading(
+    tau: Float, x: Float, step: Float, bell: Float, along: Float, blur: Float, half_width: Float
+) -> tuple[Float, Float, Float]:
     """What the shading inside may look like, blurred: terms, derivatives by depth and by log blur, (..., terms) each.
 
     The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
     shadow or a highlight begins, stand for the rest.
+
+    Args:
+        x: `tau / blur`, with its normal distribution `step` and density `bell`.
     """
-    scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
-    x = tau / blur
+    terms, by_depth, by_width = (np.empty((*tau.shape, SHADING_TERMS)) for _ in range(3))
     here = along / _TREND_PX
-    bell = np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
-    inside = [(ndtr(x), bell / blur, -bell * x)]
-    inside.append(tuple(value * here for value in inside[0]))
+    terms[..., 0], by_depth[..., 0], by_width[..., 0] = step, bell / blur, -bell * x
+    for table in (terms, by_depth, by_width):
+        table[..., 1] = table[..., 0] * here
+    scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
     root = scale * np.interp(x, _LIMB_X, _LIMB_Y)
     root_slope = scale * np.interp(x, _LIMB_X, _LIMB_SLOPE) / blur
-    terms, by_depth, by_width = (list(values) for values in zip(*inside, strict=True))
-    terms.append(root)
-    by_depth.append(root_slope)
-    by_width.append(0.5 * root - root_slope * tau)
-    for start in _KINKS_PX:
-        y = (tau - start) / blur
-        bell = np.exp(-0.5 * y**2) / np.sqrt(2 * np.pi)
-        terms.append(((tau - start) * ndtr(y) + blur * bell) / half_width)
-        by_depth.append(ndtr(y) / half_width)
-        by_width.append(blur * bell / half_width)
-    return np.stack(terms, axis=-1), np.stack(by_depth, axis=-1), np.stack(by_width, axis=-1)
+    terms[..., 2], by_depth[..., 2], by_width[..., 2] = root, root_slope, 0.5 * root - root_slope * tau
+    for i, start in enumerate(_KINKS_PX, 3):
+        y = x - start / blur
+        beyond, density = (step, bell) if start == 0.0 else (ndtr(y), _bell(y))
+        terms[..., i] = ((tau - start) * beyond + blur * density) / half_width
+        by_depth[..., i] = beyond / half_width
+        by_width[..., i] = blur * density / half_width
+    return terms, by_depth, by_width

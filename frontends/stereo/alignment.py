@@ -19,8 +19,9 @@ Float32 = NDArray[np.float32]
 Bool = NDArray[np.bool_]
 
 
-_CONVERGED_PX = 0.01
-"""A patch that still moves more than this after the last step is given up: those that creep are the bad ones."""
+_CONVERGED_PX = 0.003
+"""What is left after a step is a share of it, towards the guess, and alike in all patches: it has to be small. A patch
+that still moves more than this after the last step is given up: those that creep are the bad ones."""
 _LONGEST_STEP_PX = 1.5
 _LARGEST_BEND = 0.4
 _DONE = 0.4
@@ -184,7 +185,7 @@ def align(
     guess: Float,
     linear: Float,
     grid: PatchGrid,
-    iterations: int = 6,
+    iterations: int = 9,
     reach_px: float = 3.0,
 ) -> Alignment:
     """Places (n, 2) in a smoothed image where the reference patches fit best, near `guess` (n, 2).

@@ -17,6 +17,7 @@ from ..messages import (
     DetectionsBody,
     ImageBody,
     Message,
+    PickBody,
     PoseBody,
 )
 from ..pixels import CompressedPixels
@@ -112,8 +113,10 @@ class Admission:
 
     def _stamp(self, known: _Topic, message: Message, received_ns: int) -> str | None:
         """A clock may be wrong by any amount, as long as it goes on so; one stamp from the future is an error."""
+        if isinstance(message.body, CameraInfoBody | PickBody):
+            return None  # a calibration holds always, and a click may be in an image of a while ago
         if message.stamp_ns <= 0:
-            return None if isinstance(message.body, CameraInfoBody) else "unstamped"
+            return "unstamped"
         offset = message.stamp_ns - received_ns
         if known.offset_ns is None:
             known.offset_ns = offset

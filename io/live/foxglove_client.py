@@ -107,6 +107,9 @@ class FoxgloveClient:
                 self._status = f"connection lost ({error})"
             except (OSError, InvalidHandshake, InvalidURI, EOFError) as error:
                 self._status = f"cannot connect ({error})"
+            except Exception as error:  # whatever a stranger's server provokes must not end the source
+                self._intake.tally.add("errors")
+                self._status = f"{type(error).__name__}: {error}"
             self._connected = False
             if backoff.wait(self._stopping):
                 break

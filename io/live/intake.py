@@ -2,12 +2,13 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping
+from dataclasses import replace
 
 import zstandard
 
 from ...factors.errors import LogError
 from ..decode import ChannelInfo, Decoder, decoder_for
-from ..messages import OtherBody
+from ..messages import CameraInfoBody, OtherBody
 from .admission import Admission, Expected, Limits
 from .definitions import UnknownTypeError, with_own_definition
 from .interfaces import Clock, Deliver
@@ -117,6 +118,8 @@ class Intake:
         reason = self._admission.refusal(message, sender, sent_ns)
         if reason is not None:
             return reason
+        if isinstance(message.body, CameraInfoBody) and abs(message.stamp_ns - sent_ns) > self.limits.stamp_error_ns:
+            message = replace(message, stamp_ns=0)  # some drivers stamp a calibration once and send it for ever
         deliver(message)
         return "delivered"
 

@@ -7,6 +7,7 @@ line back for each: `{"accepted": true, "text": "..."}`.
 import asyncio
 import contextlib
 import json
+import socket
 import threading
 from collections.abc import Mapping
 
@@ -19,6 +20,7 @@ from .outbox import Outbox
 from .tally import Tally
 from .views import json_object
 
+_SENDING = 64 << 10
 _MAXIMUM_UNAUTHORISED = 5
 _MAXIMUM_MALFORMED = 100
 
@@ -129,8 +131,10 @@ class JsonServer:
             self._tally.add("refused_connections")
             writer.transport.abort()
             return
-        keep_alive(writer.get_extra_info("socket"))
-        writer.transport.set_write_buffer_limits(high=64 << 10)
+        connection = writer.get_extra_info("socket")
+        keep_alive(connection)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SENDING)  # what waits there only grows old
+        writer.transport.set_write_buffer_limits(high=_SENDING)
         mailbox = Mailbox(self._loop.loop, maximum_bytes=self._client_bytes)
         with self._lock:
             self._mailboxes[writer] = mailbox

@@ -98,6 +98,9 @@ class McapStream:
                 self._status = "the stream ended"
             except (OSError, LogError) as error:
                 self._status = str(error)
+            except Exception as error:  # whatever a stranger's bytes provoke must not end the source
+                self._intake.tally.add("errors")
+                self._status = f"{type(error).__name__}: {error}"
             self._connected = False
             if self._target is None or backoff.wait(self._stopping):
                 break

@@ -26,6 +26,8 @@ class Recorder:
     what comes then is counted as dropped, and a new part (`NAME-1.mcap`, ...) is begun once writing works again. A new
     part is begun too where the file exists already: nothing is ever overwritten.
 
+    A part is also ended after `part_s`: what a writer has to remember of a file grows with the file.
+
     Args:
         images: record the images too.
         attachments: name, media type and bytes, such as the rig, at the start of each part.
@@ -39,6 +41,7 @@ class Recorder:
         images: bool = False,
         attachments: tuple[tuple[str, str, bytes], ...] = (),
         flush_s: float = 1.0,
+        part_s: float = 3600.0,
         open_file: OpenFile | None = None,
     ) -> None:
         self._path = path
@@ -55,7 +58,9 @@ class Recorder:
             maximum_updates=256,
             maximum_image_bytes=32 << 20,
         )
+        self._part_s = part_s
         self._part = 0
+        self._begun_s = 0.0
         self._file: _Whole | None = None
         self._sink: McapSink | None = None
         self._sound = 0
@@ -93,18 +98,7 @@ class Recorder:
     def stop(self) -> None:
         self._outbox.stop()
         with self._closing:
-            sink, file = self._sink, self._file
-            self._sink = self._file = None
-            if sink is None or file is None:
-                return
-            try:
-                sink.close()
-                os.fsync(file.fileno())
-                self._status = "finished"
-            except (OSError, LogError) as error:
-                self._status = str(error)
-            finally:
-                _close(file)
+            self._finish()
 
     def counters(self) -> Mapping[str, int]:
         return self._outbox.counters()
@@ -130,14 +124,31 @@ class Recorder:
     def _flush(self) -> None:
         with self._closing:
             if self._sink is None or self._file is None:
-                self._ready()
-                return
+                return  # the next update tries again
             try:
                 self._sink.flush()
                 os.fsync(self._file.fileno())
                 self._sound = self._file.tell()
+                if time.monotonic() - self._begun_s > self._part_s:
+                    self._finish()
             except (OSError, LogError) as error:
                 self._give_up(error)
+
+    def _finish(self) -> None:
+        """End the part in order."""
+        sink, file = self._sink, self._file
+        self._sink = self._file = None
+        if sink is None or file is None:
+            return
+        try:
+            sink.close()
+            os.fsync(file.fileno())
+            self._status = "finished"
+        except (OSError, LogError) as error:
+            self._status = str(error)
+            self._tally.add("errors")
+        finally:
+            _close(file)
 
     def _ready(self) -> bool:
         """Whether there is a file to write to; begins a new part when it is time to try."""
@@ -145,11 +156,11 @@ class Recorder:
             return True
         if time.monotonic() < self._retry_s:
             return False
-        self._retry_s = time.monotonic() + _RETRY_S
         try:
             self._begin()
         except (OSError, LogError) as error:
             self._status = str(error)
+            self._retry_s = time.monotonic() + _RETRY_S
             return False
         return True
 
@@ -167,6 +178,7 @@ class Recorder:
             path.unlink(missing_ok=True)
             raise
         self._file, self._sink, self._sound = file, sink, file.tell()
+        self._begun_s = time.monotonic()
         self._status = f"writing {path.name}"
 
     def _free_path(self) -> Path:

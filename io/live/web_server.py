@@ -187,7 +187,7 @@ class _Server(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 16
+    request_queue_size = 64
 
     def __init__(
         self, address: tuple[str, int], maximum: int, answer: Callable[[str], tuple[int, str, bytes]], tally: Tally

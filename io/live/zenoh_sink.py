@@ -10,7 +10,7 @@ import zenoh
 from ...factors.errors import LogError
 from ..schemas import typestore
 from .backoff import Backoff
-from .interfaces import LiveImage, LiveUpdate, OnCommand
+from .interfaces import Clock, LiveImage, LiveUpdate, OnCommand
 from .outbox import Outbox
 from .tally import Tally
 from .views import ros_messages
@@ -30,13 +30,15 @@ class ZenohSink:
         domain: ROS_DOMAIN_ID of the robot.
     """
 
-    def __init__(self, router: str = DEFAULT_ROUTER, *, domain: int = 0) -> None:
+    def __init__(self, router: str = DEFAULT_ROUTER, *, domain: int = 0, clock: Clock = time.time_ns) -> None:
         check_router(router)
         self._router = router
         self._domain = domain
+        self._clock = clock
         self._tally = Tally()
         self._outbox = Outbox("surecut-zenoh-sink", self._send, self._tally)
         self._session: zenoh.Session | None = None
+        self._token: zenoh.LivelinessToken | None = None
         self._publishers: dict[str, _Publisher] = {}
         self._stopping = threading.Event()
         self._linking: threading.Thread | None = None
@@ -77,8 +79,10 @@ class ZenohSink:
         backoff = Backoff()
         while self._session is None:
             try:
-                self._session, self._status = open_session(self._router), "connected"
-            except LogError as error:
+                session = open_session(self._router)
+                self._token = session.liveliness().declare_token(_announcement(session, self._domain))
+                self._session, self._status = session, "connected"
+            except (LogError, zenoh.ZError) as error:
                 self._status = str(error)
                 if backoff.wait(self._stopping):
                     return
@@ -98,7 +102,7 @@ class ZenohSink:
             if publisher is None:
                 publisher = _Publisher(session, self._domain, topic, type_name, len(self._publishers) + 1)
                 self._publishers[topic] = publisher
-            publisher.put(bytes(typestore().serialize_cdr(message, type_name)))
+            publisher.put(bytes(typestore().serialize_cdr(message, type_name)), self._clock())
         self._tally.add("sent")
 
 
@@ -111,18 +115,19 @@ class _Publisher:
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.DATA,
         )
-        self._token = session.liveliness().declare_token(_announcement(session, domain, topic, type_name, number))
+        _, kind, digest = key_of(domain, topic, type_name).rsplit("/", 2)
+        what = f"{topic.replace('/', '%')}/{kind}/{digest}/{_QOS}"
+        self._token = session.liveliness().declare_token(_announcement(session, domain, number, "MP", what))
         self._gid = os.urandom(16)
         self._sequence = 0
 
-    def put(self, data: bytes) -> None:
+    def put(self, data: bytes, now_ns: int) -> None:
         self._sequence += 1
-        attachment = Attachment(self._sequence, time.time_ns(), self._gid)
+        attachment = Attachment(self._sequence, now_ns, self._gid)
         self._publisher.put(data, attachment=attachment.encode())
 
 
-def _announcement(session: zenoh.Session, domain: int, topic: str, type_name: str, number: int) -> str:
-    """rmw_zenoh's liveliness key of a publisher."""
-    _, kind, digest = key_of(domain, topic, type_name).rsplit("/", 2)
-    mangled = topic.replace("/", "%")
-    return f"@ros2_lv/{domain}/{session.info.zid()}/0/{number}/MP/%/%/{_NODE}/{mangled}/{kind}/{digest}/{_QOS}"
+def _announcement(session: zenoh.Session, domain: int, number: int = 0, kind: str = "NN", what: str = "") -> str:
+    """rmw_zenoh's liveliness key of the node (`NN`) or of one of its publishers (`MP`)."""
+    key = f"@ros2_lv/{domain}/{session.info.zid()}/0/{number}/{kind}/%/%/{_NODE}"
+    return f"{key}/{what}" if what else key

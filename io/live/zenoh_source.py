@@ -54,6 +54,7 @@ class ZenohSource:
         self._queue: BoundedQueue[_Sample] = BoundedQueue(maximum_count, maximum_bytes)
         self._channels: dict[tuple[str, str], ChannelInfo | str] = {}
         self._session: zenoh.Session | None = None
+        self._subscribers: list[zenoh.Subscriber] = []
         self._stopping = threading.Event()
         self._status = "not started"
         self._threads: list[threading.Thread] = []
@@ -115,8 +116,10 @@ class ZenohSource:
         while self._session is None:
             try:
                 session = open_session(self._router)
-                for topic in self._topics:
+                self._subscribers = [
                     session.declare_subscriber(any_type(self._domain, topic), partial(self._sample, topic))
+                    for topic in self._topics
+                ]
                 self._session, self._status = session, "connected"
             except (LogError, zenoh.ZError) as error:
                 self._status = str(error)

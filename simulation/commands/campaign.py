@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from ...estimator.executor import choose_executor
+from ...estimator.executor import Executor, choose_executor
 from ...estimator.validated_range import range_text
 from ...factors.errors import SurecutError
 from ..campaign import open_campaign, run_campaign, write_whole
 from ..campaign_range import validated_range
-from ..campaign_real import real_table, real_text
+from ..campaign_real import real_table, real_tasks, real_text
 from ..campaign_report import label, quantity_text, report_html
 from ..campaign_table import CampaignTable, tabulate, write_tables
 from ..campaign_validation import update_validation
@@ -39,6 +39,9 @@ def command(
     decisions: Annotated[
         bool, typer.Option("--decisions", help="Decide random cuts in every run: wrong GOs, and power.")
     ] = False,
+    sensitivity: Annotated[
+        bool, typer.Option("--sensitivity", help="Change one input after the other: how far do the points move?")
+    ] = False,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
     range_file: Annotated[
@@ -46,27 +49,26 @@ def command(
     ] = None,
 ) -> None:
     """Runs a campaign and writes summary.json, summary.csv, quantities.csv and report.html."""
-    console = Console()
+    console, when = Console(), stamp()
     if real is not None:
-        _real(console, real, output, validation)
+        _real(console, real, output, validation, choose_executor(jobs, dask))
         return
-    campaign = open_campaign(scenario, level, leave_out, decisions)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console) as progress:
+    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity)
+    with _bar(console) as progress:
         task = progress.add_task("runs", total=runs)
         executor = choose_executor(jobs, dask)
         rows = run_campaign(output, campaign, runs, executor, lambda count: progress.advance(task, count))
     table = tabulate(rows)
-    notes = [f"Scenario {scenario}, level {level}.", stamp()]
+    notes = [f"Scenario {scenario}, level {level}.", when]
     write_tables(output, table, rows)
     write_whole(output / "report.html", report_html(f"Campaign {scenario}", table, rows, notes))
     _print(console, table)
     console.print(f"{output / 'report.html'}")
     if validation is not None:
         name = f"{scenario}, decisions" if decisions else scenario
-        update_validation(validation, name, level, table, stamp())
+        update_validation(validation, name, level, table, when)
     if range_file is not None:
-        write_whole(range_file, range_text(validated_range(rows, level, stamp())))
+        write_whole(range_file, range_text(validated_range(rows, level, when)))
         console.print(f"{range_file}")
     if table.failed == table.runs:
         raise SurecutError(f"no run gave a result; the first says: {next(iter(table.reasons))}")
@@ -114,13 +116,24 @@ def _print(console: Console, table: CampaignTable) -> None:
     )
 
 
-def _real(console: Console, folder: Path, output: Path, validation: Path | None) -> None:
-    rows = real_table(folder)
-    if not rows:
+def _real(console: Console, folder: Path, output: Path, validation: Path | None, executor: Executor) -> None:
+    tasks = real_tasks(folder)
+    if not tasks:
         raise SurecutError(f"{folder}: holds none of the recordings that are known; see its README")
-    output.mkdir(parents=True, exist_ok=True)
+    with _bar(console) as progress:
+        bar = progress.add_task("recordings", total=len(tasks))
+
+        def done(name: str) -> None:
+            progress.update(bar, advance=1, description=name)
+
+        rows = real_table(folder, output, executor, done)
     text = real_text(rows)
     write_whole(output / "real.md", text)
     console.print(text, markup=False)
     if validation is not None:
         update_validation(validation, "real recordings", "with references", text, stamp())
+
+
+def _bar(console: Console) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=console)
