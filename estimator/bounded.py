@@ -7,10 +7,13 @@ does not grow with the time that the run has taken.
 from collections import Counter
 from dataclasses import dataclass, field
 
+import gtsam
+
 from ..factors import keys
 from ..factors.measurements import Rejection
 from .batch import MINIMUM_VIEWS, outliers
 from .engine import Engine
+from .incremental import Cut
 from .linearised import linearise
 from .marginal import FAMILY
 
@@ -25,6 +28,9 @@ class Limits:
     """Keyframes that leave together."""
     map_landmarks: int = 60
     """Landmarks of keyframes that left which stay, so that places that are seen again hold the camera."""
+    shared_landmarks: int = 40
+    """Landmarks seen on both sides of the cut that go on holding the camera to its past. Each one more makes the prior
+    larger, and it is dense. The others are taken for two points, one on each side: that only leaves something out."""
     told: int = 1000
     """Refused measurements and events that are kept with their words; all are counted."""
     frames: int = 2000
@@ -69,7 +75,8 @@ class Bounded:
         landmarks = self._landmarks_of(poses)
         self.refused_landmarks(landmarks.lonely)
         leaving = poses | landmarks.gone
-        engine.state.values = engine.solver.reduce(leaving, landmarks.lonely, engine.end_ns)
+        cut = Cut(leaving, landmarks.lonely, landmarks.split)
+        engine.state.values = engine.solver.reduce(cut, engine.end_ns)
         self.first = first
         self.rebuilt += 1
         engine.forget(leaving | landmarks.lonely)
@@ -89,6 +96,8 @@ class Bounded:
         inside: Counter[int] = Counter()
         outside: Counter[int] = Counter()
         every: set[int] = set()
+        bound: set[int] = set()
+        """On a surface of the Kinect's: those factors know their variables by name."""
         for _, factor, record in self.engine.solver.log.active():
             involved = factor.keys()
             marks = [k for k in involved if keys.kind(k) == "l"]
@@ -97,11 +106,16 @@ class Bounded:
                 inside.update(dict.fromkeys(marks, MINIMUM_VIEWS))
             elif record.camera is not None and marks:
                 (inside if poses.intersection(involved) else outside).update(marks)
+            if isinstance(factor, gtsam.CustomFactor):
+                bound.update(marks)
         seen = {k for k in every if not outside[k]}
         lonely = {k for k in seen if inside[k] < MINIMUM_VIEWS}
         views = self.engine.odometry.observations
         known = sorted(seen - lonely, key=lambda k: -views.get(keys.index(k), 0))
-        return _Landmarks(set(known[self.limits.map_landmarks :]), lonely)
+        both = [k for k in every - seen if inside[k] >= MINIMUM_VIEWS and k not in bound]
+        both.sort(key=lambda k: -(inside[k] * outside[k]))
+        split = {k for k in both[self.limits.shared_landmarks :] if outside[k] >= MINIMUM_VIEWS}
+        return _Landmarks(set(known[self.limits.map_landmarks :]), lonely, split)
 
     def refused_landmarks(self, lonely: set[int]) -> None:
         """Tells of the views that go with landmarks that are no points."""
@@ -125,3 +139,4 @@ class Bounded:
 class _Landmarks:
     gone: set[int]
     lonely: set[int]
+    split: set[int]

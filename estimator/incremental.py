@@ -1,6 +1,7 @@
 """The running solver: iSAM2 over the factors as they come."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -42,6 +43,18 @@ SETTLE_ROUNDS = 2
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What leaves the graph, and how."""
+
+    leaving: set[int]
+    """Keys; what their factors say about the others stays, as one Gaussian factor."""
+    dropped: set[int]
+    """Keys that go with all of their factors, as if they had never been measured."""
+    split: set[int]
+    """Landmarks that stay, of which the factors of what leaves are taken for those of another point."""
 
 
 class Incremental:
@@ -128,36 +141,36 @@ class Incremental:
         """Takes factors out again, by their places in the log."""
         return self.update(Update(), remove)
 
-    def reduce(self, leaving: Collection[int], dropped: Collection[int], stamp_ns: int) -> gtsam.Values:
+    def reduce(self, cut: Cut, stamp_ns: int) -> gtsam.Values:
         """Takes variables out of the graph and starts iSAM2 anew on the rest.
-
-        Args:
-            leaving: keys; what their factors say about the others stays, as one Gaussian factor.
-            dropped: keys that go with all of their factors, as if they had never been measured.
 
         Raises:
             ObservabilityError: a variable that leaves is not determined.
         """
         self.settle(SETTLE_ROUNDS)
-        gone, without = set(leaving), set(dropped)
+        values = gtsam.Values(self._values)
+        past = {key: keys.landmark_before(keys.index(key)) for key in cut.split}
+        for key, before in past.items():
+            values.insert(before, values.atPoint3(key))
+        gone = {*cut.leaving, *past.values()}
         absorbed: list[gtsam.NonlinearFactor] = []
         log = FactorLog()
         for _, factor, record in self.log.active():
             involved = set(factor.keys())
-            if involved & without:
+            if involved & cut.dropped:
                 continue
-            if involved & gone or record.family == FAMILY:
-                absorbed.append(factor)
+            if involved & cut.leaving or record.family == FAMILY:
+                torn = [past.get(key, key) for key in factor.keys()]
+                absorbed.append(factor.rekey(torn) if involved & cut.split else factor)
             else:
                 log.factors.append(factor)
                 log.records.append(record)
         with determined():
-            prior = marginal(absorbed, self._values, gone)
+            prior = marginal(absorbed, values, gone)
         what = f"what earlier keyframes said about {len(prior.keys)} variables"
         log.factors.append(prior.factor())
         log.records.append(Record(FAMILY, FAMILY, stamp_ns, what, rejectable=False))
-        values = gtsam.Values(self._values)
-        for key in gone | without:
+        for key in gone | cut.dropped:
             values.erase(key)
         self.log = log
         self._begin(values)

@@ -70,7 +70,7 @@ def marginal(factors: Sequence[gtsam.NonlinearFactor], values: gtsam.Values, gon
 
 def _eliminated(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, gone: set[int]) -> GaussianPrior:
     order = gtsam.Ordering()
-    for key in sorted(gone, key=lambda k: (keys.kind(k) != "l", k)):  # landmarks first: they are sparse
+    for key in sorted(gone, key=lambda k: (keys.kind(k) not in "lz", k)):  # landmarks first: they are sparse
         order.push_back(key)
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(order)
     joint = gtsam.HessianFactor(rest)

@@ -33,6 +33,11 @@ def landmark(track: int) -> int:
     return gtsam.symbol("l", track)
 
 
+def landmark_before(track: int) -> int:
+    """A landmark as earlier keyframes saw it, where it is torn from what later ones see: Point3."""
+    return gtsam.symbol("z", track)
+
+
 def corner(slot: int, index: int) -> int:
     """Corner `index` (0..3) of the marker in `slot` (one per marker and board epoch), in {o}: Point3."""
     return gtsam.symbol("q", 4 * slot + index)
