@@ -32,6 +32,11 @@ bench: $(READY)
 
 campaign: $(READY)
 	$(BIN)/surecut campaign -o logs/campaign --runs 1000 --jobs 2 --validation docs/validation.md
+	$(BIN)/surecut campaign -o logs/decisions --decisions --runs 200 --jobs 2 --validation docs/validation.md
+	$(BIN)/surecut campaign -o logs/half-noise --scenario half-noise --runs 100 --jobs 2 --validation docs/validation.md
+	$(BIN)/surecut campaign -o logs/outliers --scenario outliers --runs 100 --jobs 2 --validation docs/validation.md
+	$(BIN)/surecut campaign -o logs/validation --scenario validation --runs 300 --jobs 2 \
+		--validation docs/validation.md --range estimator/validated_range.yaml
 
 clean:
 	rm -rf $(VENV) build *.egg-info

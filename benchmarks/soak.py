@@ -79,6 +79,8 @@ def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
 
     stream.run(progress)
     print(json.dumps({k: v for k, v in stream.counters().items() if not k.startswith("source")}))
+    if stream.last_problem:
+        print(stream.last_problem)
     return samples
 
 

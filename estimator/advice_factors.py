@@ -15,7 +15,7 @@ from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Board
 from .advice_scene import Surroundings, View
 from .advice_update import Predicted
-from .boards import FAMILY as CORNERS
+from .board_inspection import FAMILY as CORNERS
 from .pipes import EDGE_FLOOR_PX
 from .pipes import FAMILY as PICKS
 

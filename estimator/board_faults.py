@@ -13,7 +13,8 @@ from ..factors.board import page_factor, print_scale_prior, shift_directions, si
 from ..factors.chance import chi2_isf, normal_isf
 from ..factors.measurements import Event, Rejection
 from .batch import BatchSolution, solve
-from .boards import DISTANCES, FREE_SIDE_REL, GEOMETRY, scale_words, side_words
+from .board_news import GEOMETRY, scale_words, side_words
+from .boards import DISTANCES, FREE_SIDE_REL
 from .corner_inset import Insets, corrected_corners, inset_directions
 from .correlation import Active
 from .engine import Engine
@@ -147,7 +148,7 @@ def _correct_insets(look: _Look) -> _Look:
                 "ones; moved outwards"
             )
             values = {"inset_px": float(value[i]), "sigma_px": float(sigma[i])}
-            engine.boards.say(engine.end_ns, "corner_inset", f"{board} {camera}", text, "info", **values)
+            engine.boards.news.say(engine.end_ns, "corner_inset", f"{board} {camera}", text, "info", **values)
     if not told.any():
         return look
     moved = {name: float(value[i]) for i, name in enumerate(look.insets.names) if told[i]}
@@ -175,7 +176,7 @@ def _side_fault(look: _Look, sheet: Sheet) -> Fault | None:
     if place is None:
         return None
     position, index, record = place
-    if look.engine.boards.told("side_length_wrong", sheet.board.id):
+    if look.engine.boards.news.told("side_length_wrong", sheet.board.id):
         off, sigma = _side_off(look, sheet)
         inside = abs(off) / float(np.hypot(sigma, sheet.board.side_sigma_m)) < GATE_SIGMA
         return Fault("side_restored", 1e9, sheet, index, record) if inside else None
@@ -205,7 +206,7 @@ def _scale_fault(look: _Look, sheet: Sheet) -> Fault | None:
     """The page's given size against everything else. A single marker has a side length, and no size beside it."""
     place = look.find(scale_words(sheet.board.id))
     alone = len({page.marker for page in sheet.pages.values()}) < 2
-    if place is None or alone or look.engine.boards.told("print_scale_wrong", sheet.board.id):
+    if place is None or alone or look.engine.boards.news.told("print_scale_wrong", sheet.board.id):
         return None
     off = deviate(*look.system.standardised([place[0]])[0])
     return Fault("scale", off / GATE_SIGMA, sheet, place[1], place[2])
@@ -268,14 +269,14 @@ def _released(engine: Engine, fault: Fault, solution: BatchSolution) -> tuple[Up
     board, stamp_ns = sheet.board, fault.record.stamp_ns
     side, scale = solution.values.atVector(sheet.page)
     if fault.kind == "side":
-        boards.reject_side(sheet, stamp_ns, GATE_SIGMA * fault.excess)
-        boards.say_side(sheet, stamp_ns, float(side), 0.0)
+        boards.news.reject_side(sheet, stamp_ns, GATE_SIGMA * fault.excess)
+        boards.news.say_side(sheet, stamp_ns, float(side), 0.0)
         update.add(side_prior(sheet.page, float(side / scale), FREE_SIDE_REL * float(side)), fault.record)
     elif fault.kind == "side_restored":
-        boards.unsay("side_length_wrong", board.id)
+        boards.news.unsay("side_length_wrong", board.id)
         update.add(side_prior(sheet.page, board.side_m, board.side_sigma_m), fault.record)
     elif fault.kind == "scale":
-        boards.say(stamp_ns, "print_scale_wrong", board.id, "", "warning")
+        boards.news.say(stamp_ns, "print_scale_wrong", board.id, "", "warning")
         rejection = Rejection(
             stamp_ns, DISTANCES, scale_words(board.id), "off by sigmas", GATE_SIGMA * fault.excess, GATE_SIGMA
         )
@@ -305,7 +306,7 @@ def _rejoin(engine: Engine, sheet: Sheet, fault: Fault, update: Update) -> None:
     record = Record(GEOMETRY, what, fault.record.stamp_ns, what, rejectable=False)
     update.add(gtsam.BetweenFactorPose3(old, new, gtsam.Pose3(), model), record)
     sheet.knocks = [k for k in sheet.knocks if k.epoch != epoch]
-    engine.boards.unsay("board_knocked", f"{sheet.board.id} {epoch}")
+    engine.boards.news.unsay("board_knocked", f"{sheet.board.id} {epoch}")
 
 
 def _tell_loose(engine: Engine, fault: Fault) -> None:
@@ -316,7 +317,7 @@ def _tell_loose(engine: Engine, fault: Fault) -> None:
     )
     stamp_ns = fault.record.stamp_ns
     values = {"marker": float(fault.marker), "shift_m": fault.shift_m, "sigma_m": fault.shift_sigma_m}
-    engine.boards.say(stamp_ns, "marker_loose", f"{board.id} {fault.marker}", text, "warning", **values)
+    engine.boards.news.say(stamp_ns, "marker_loose", f"{board.id} {fault.marker}", text, "warning", **values)
     what = fault.record.what
     engine.rejected.append(Rejection(stamp_ns, GEOMETRY, what, "off by sigmas", fault.excess * limit, limit))
 
@@ -329,11 +330,11 @@ def _tell(look: _Look) -> None:
     boards = look.engine.boards
     for sheet in boards.sheets.values():
         name = sheet.board.id
-        event = boards.told("side_length_wrong", name)
+        event = boards.news.told("side_length_wrong", name)
         if event is not None:
             side = float(look.values.atVector(sheet.page)[0])
-            boards.say_side(sheet, event.stamp_ns, side, _sigma(look, sheet, 0))
-        event = boards.told("print_scale_wrong", name)
+            boards.news.say_side(sheet, event.stamp_ns, side, _sigma(look, sheet, 0))
+        event = boards.news.told("print_scale_wrong", name)
         if event is not None:
             _tell_scale(look, sheet, event)
         for knock in sheet.knocks:
@@ -356,10 +357,10 @@ def _tell_scale(look: _Look, sheet: Sheet, event: Event) -> None:
         "the rig gives; used the log's"
     )
     values = {"scale": scale, "sigma": sigma}
-    look.engine.boards.say(event.stamp_ns, "print_scale_wrong", sheet.board.id, text, "warning", **values)
+    look.engine.boards.news.say(event.stamp_ns, "print_scale_wrong", sheet.board.id, text, "warning", **values)
 
 
 def _tell_knock(look: _Look, sheet: Sheet, knock: Knock) -> None:
     moved = _moved(look, sheet, knock)
     if moved is not None:
-        look.engine.boards.say_knock(sheet, knock, *moved)
+        look.engine.boards.news.say_knock(sheet, knock, *moved)

@@ -7,35 +7,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from ..factors.board import page_corners, page_factor, print_scale_prior, side_prior
+from ..factors.board import page_corners, print_scale_prior, side_prior
 from ..factors.chance import chi2_isf
 from ..factors.measurements import Event, MarkerSighting, Rejection
-from ..factors.noise import gaussian, robust
-from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Rig
-from ..frontends.board_fit import corner_covariance
 from ..frontends.board_pose import board_pose_candidates
-from .board_inspection import FAMILY, Inspection
+from .board_inspection import Inspection
 from .board_moves import Joint, displacement, may_be_the_board, new_place, scaled_pose, still_moving
-from .board_start import FirstPose, Side, inset_sigma_px
+from .board_news import GEOMETRY, SIDE_GATE_SIGMA, BoardNews, rejection, scale_words, side_words
+from .board_start import FirstPose, Side
+from .corner_factors import CornerFactors
 from .graph import Record, State, Update
 from .result import CalibrationEstimate
-from .sheet import Displaced, Knock, PageFactor, Sheet
-from .view_cells import ViewCells, added_covariance
+from .sheet import Displaced, Knock, Sheet
 
 Float = NDArray[np.float64]
 
-GEOMETRY = "board geometry"
 DISTANCES = "known distances"
 FREE_SIDE_REL = 0.5
 """Sigma of a side length whose given value the log contradicts: it says no more than that there is one."""
-SIDE_GATE_SIGMA = 5.0
 LOOK_AGAIN_PX = 1.0
 """Common shift of a board against its predicted place from which on the prediction is made exact and tested."""
 HELD_VIEWS = 40
 """Views of a board without a pose that are kept."""
-STILL_VIEWS = 40
-"""Views of a board from one place after which further ones are left out: they would count one part in so many."""
 
 
 class Boards:
@@ -46,34 +40,30 @@ class Boards:
         self._state = state
         self.sheets = {board.id: Sheet(i, board) for i, board in enumerate(rig.boards)}
         self._markers = {(b.id, m.id): m for b in rig.boards for m in b.markers}
-        self._next_slot = 0
-        self._cells: dict[tuple[str, str], ViewCells] = {}
         self._first = FirstPose(rig, state)
         self.inspection = Inspection(rig, state, self._first.pinhole)
-        self._told: dict[tuple[str, str], Event] = {}
-        self._refused: list[Rejection] = []
+        self.news = BoardNews(rig)
+        self.corners = CornerFactors(rig, state, self.news)
         self.insets: list[CalibrationEstimate] = []
         """After the run: how far the corners lie inside the true ones, by camera and board."""
-        self.inset_sigma_px: dict[tuple[str, str], float] = {}
-        """By camera and board: how far its corners may all lie inside (or outside) of the true ones."""
 
     # What others ask ------------------------------------------------------------------------------------------
 
     @property
     def events(self) -> list[Event]:
         """What contradicts the rig, as far as it is known."""
-        return [*self._told.values(), *self.inspection.events.values()]
+        return [*self.news.events, *self.inspection.events.values()]
 
     @property
     def rejected(self) -> list[Rejection]:
-        return [*self._refused, *self.inspection.rejected]
+        return [*self.news.refused, *self.inspection.rejected]
 
     def begin_slots(self, first: int) -> None:
         """New markers get slots from here on: those before are taken."""
         self._next_slot = first
 
     def lists_of_rejections(self) -> list[list[Rejection]]:
-        return [self._refused, self.inspection.rejected]
+        return [self.news.refused, self.inspection.rejected]
 
     def known(self, board: str) -> bool:
         """Has the board a pose in the graph?"""
@@ -199,7 +189,7 @@ class Boards:
         sheet.held.append((keyframe, seen))
         if len(sheet.held) > HELD_VIEWS:
             _, dropped = sheet.held.pop(1)
-            self._refuse(sheet, dropped, "board not placed for long, views held", len(sheet.held), HELD_VIEWS)
+            self.news.refuse(sheet, dropped, "board not placed for long, views held", len(sheet.held), HELD_VIEWS)
 
     def _start(
         self,
@@ -215,7 +205,7 @@ class Boards:
             return
         if not start.sure:
             text = f"board {sheet.board.id} starts from a view that allows two poses; took the better one"
-            self.say(seen[0].stamp_ns, "ambiguous_start", sheet.board.id, text, "info")
+            self.news.say(seen[0].stamp_ns, "ambiguous_start", sheet.board.id, text, "info")
         update.guess(sheet.key, start.o_T_f)
         self._open_page(sheet, start.side, seen[0].stamp_ns, update)
         sheet.known = True
@@ -233,8 +223,8 @@ class Boards:
         if side.sigma_m is not None:
             off = abs(side.length_m - mean) / float(np.hypot(side.sigma_m, sigma))
             if off > SIDE_GATE_SIGMA:
-                self.say_side(sheet, stamp_ns, side.length_m, side.sigma_m)
-                self.reject_side(sheet, stamp_ns, off)
+                self.news.say_side(sheet, stamp_ns, side.length_m, side.sigma_m)
+                self.news.reject_side(sheet, stamp_ns, off)
                 mean, sigma = side.length_m, FREE_SIDE_REL * side.length_m
         what = side_words(board.id)
         update.add(side_prior(sheet.page, mean, sigma), Record(GEOMETRY, what, stamp_ns, what, rejectable=False))
@@ -273,7 +263,7 @@ class Boards:
 
     def _forget(self, sheet: Sheet, views: Sequence[Displaced]) -> None:
         for view in views:
-            self._refuse(sheet, view.seen, "board not in its place, views that agree", 1.0, 3.0)
+            self.news.refuse(sheet, view.seen, "board not in its place, views that agree", 1.0, 3.0)
         sheet.displaced = [v for v in sheet.displaced if not any(v is gone for gone in views)]
 
     def _reopen(self, sheet: Sheet, place: gtsam.Pose3, update: Update) -> None:
@@ -285,7 +275,7 @@ class Boards:
         sheet.slots = {}
         update.guess(sheet.key, place)
         delta = gtsam.Pose3.Logmap(old.between(place))
-        self.say_knock(sheet, sheet.knocks[-1], delta, None)
+        self.news.say_knock(sheet, sheet.knocks[-1], delta, None)
         for view in views:
             self._observe(sheet, view.keyframe, None, view.seen, update)
 
@@ -301,28 +291,8 @@ class Boards:
     ) -> None:
         accepted = seen if camera_poses is None else self._gated(sheet, camera_poses, seen)
         for sighting in accepted:
-            covariance = self._with_common_part(sheet, keyframe, sighting, update)
-            if covariance is None:
-                continue
-            self._note_source(sighting)
-            slot = self._slot(sheet, sighting, update)
-            source = f"corners {sighting.camera} {sheet.board.id}"
-            for i in range(4):
-                model = robust(gaussian(covariance[i]), self._rig.gates.robust_sigma)
-                point = keys.corner(slot, i)
-                if sighting.camera == "b_rgb":
-                    factor = machine_projection(sighting.corners_px[i], model, keyframe, point)
-                else:
-                    factor = mobile_projection(sighting.camera, sighting.corners_px[i], model, keyframe, point)
-                what = f"marker {sighting.marker} corner {i} in {sighting.camera}"
-                update.add(factor, Record(FAMILY, source, sighting.stamp_ns, what, camera=sighting.camera))
-            sheet.last_seen_ns = max(sheet.last_seen_ns or 0, sighting.stamp_ns)
-
-    def _note_source(self, sighting: MarkerSighting) -> None:
-        """How far the detector of these corners may be biased."""
-        key = (sighting.camera, sighting.board)
-        sigma = inset_sigma_px(sighting, self._rig.noise)
-        self.inset_sigma_px[key] = max(sigma, self.inset_sigma_px.get(key, 0.0))
+            if self.corners.add(sheet, keyframe, sighting, update):
+                sheet.last_seen_ns = max(sheet.last_seen_ns or 0, sighting.stamp_ns)
 
     def _predicted(self, sheet: Sheet, marker: int) -> Float:
         """Corners of a marker in {o}, shape (4, 3), from the board's pose and page."""
@@ -361,136 +331,16 @@ class Boards:
                 if off < limit:
                     good.append(s)
                 else:
-                    self._refuse(sheet, [s], "off its place by px", off, limit)
+                    self.news.refuse(sheet, [s], "off its place by px", off, limit)
         return good
-
-    def _slot(self, sheet: Sheet, sighting: MarkerSighting, update: Update) -> int:
-        """The marker's corner variables, made on its first sighting."""
-        if sighting.marker in sheet.slots:
-            return sheet.slots[sighting.marker]
-        slot = sheet.slots[sighting.marker] = self._next_slot
-        self._next_slot += 1
-        marker = self._markers[sheet.board.id, sighting.marker]
-        o_T_f = self._pose_of(sheet.key, update)
-        page = sheet.page
-        side, scale = update.values.atVector(page) if update.values.exists(page) else self._state.vector(page)
-        for i, corner in enumerate(page_corners(marker, side, scale)):
-            update.guess(keys.corner(slot, i), o_T_f.transformFrom(corner))
-        after = f" after knock {sheet.epoch}" if sheet.epoch else ""
-        what = f"marker {sighting.marker} lies on page {sheet.board.id}{after}"
-        factor = page_factor(sheet.board, marker, sheet.key, page, slot, self._detection_error_m(sighting, side))
-        update.add(factor, Record(GEOMETRY, f"page {sheet.board.id}", sighting.stamp_ns, what, rejectable=False))
-        sheet.pages[what] = PageFactor(sighting.marker, slot, sheet.epoch, self._detection_error_m(sighting, side))
-        return slot
-
-    def _pose_of(self, key: int, update: Update) -> gtsam.Pose3:
-        return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
-
-    def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
-        """A corner's lasting detection error on the page, from its size in this first view.
-
-        None where the pixels were at hand: of the fit to them nothing lasts from place to place but an inset.
-        """
-        if sighting.common_px is not None:
-            return 0.0
-        diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
-        return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
-
-    def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
-        """Adds the part of a corner's error that views from the same place share; None where they are plenty.
-
-        Views are counted per cell of viewing position; the n-th one of a cell gets what it adds to those before it.
-        """
-        cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
-        if cells.last != keyframe:
-            view = self._pose_of(sheet.key, update).between(self._pose_of(keyframe, update))
-            cells.count(keyframe, view.matrix())
-        if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
-            self._refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
-            return None
-        given = self._rig.noise.marker_common_px
-        common = given if sighting.common_px is None else sighting.common_px
-        return added_covariance(corner_covariance(sighting, given), common, cells.views)
-
-    # Book-keeping ---------------------------------------------------------------------------------------------
 
     def held_back(self) -> list[Rejection]:
         """Sightings of boards that never got a pose, or not the one that these show."""
         found = []
         for sheet in self.sheets.values():
             for _, seen in sheet.held:
-                found += [_rejection(sheet, s, "board never placed: views", len(sheet.held), 1.0) for s in seen]
+                found += [rejection(sheet, s, "board never placed: views", len(sheet.held), 1.0) for s in seen]
             for view in sheet.displaced:
                 reason = "board not in its place, views that agree"
-                found += [_rejection(sheet, s, reason, len(sheet.displaced), 3.0) for s in view.seen]
+                found += [rejection(sheet, s, reason, len(sheet.displaced), 3.0) for s in view.seen]
         return found
-
-    def _refuse(self, sheet: Sheet, seen: Sequence[MarkerSighting], reason: str, value: float, limit: float) -> None:
-        self._refused += [_rejection(sheet, s, reason, value, limit) for s in seen]
-
-    def say(self, stamp_ns: int, kind: str, board: str, text: str, severity: str, **values: float) -> None:
-        """Tells something about a board; a later word on the same replaces it."""
-        self._told[kind, board] = Event(stamp_ns, kind, text, severity, values)  # type: ignore[arg-type]
-
-    def told(self, kind: str, board: str) -> Event | None:
-        """What was said about a board."""
-        return self._told.get((kind, board))
-
-    def unsay(self, kind: str, board: str) -> None:
-        """Takes back what did not hold."""
-        self._told.pop((kind, board), None)
-
-    def say_side(self, sheet: Sheet, stamp_ns: int, side_m: float, sigma_m: float) -> None:
-        board = sheet.board
-        text = (
-            f"board {board.id}: the rig says side {1e3 * board.side_m:.1f} mm, the log says {1e3 * side_m:.1f} +/- "
-            f"{1e3 * sigma_m:.1f} mm; used the log's"
-        )
-        values = {"given_m": board.side_m, "seen_m": side_m, "sigma_m": sigma_m}
-        self.say(stamp_ns, "side_length_wrong", board.id, text, "warning", **values)
-
-    def reject_side(self, sheet: Sheet, stamp_ns: int, off: float) -> None:
-        what = side_words(sheet.board.id)
-        self._refused.append(Rejection(stamp_ns, GEOMETRY, what, "off by sigmas", off, SIDE_GATE_SIGMA))
-
-    def say_knock(self, sheet: Sheet, knock: Knock, delta: Float, covariance: Float | None) -> None:
-        """`delta`: tangent of old_T_new, rotation first; `covariance` (6, 6) where it is known already."""
-        angle, length = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
-        sigmas = (0.0, 0.0)
-        moved, turned = f"{1e3 * length:.1f} mm", f"{np.degrees(angle):.2f} deg"
-        if covariance is not None:
-            u, v = delta[:3] / max(angle, 1e-9), delta[3:] / max(length, 1e-9)
-            sigmas = float(np.sqrt(u @ covariance[:3, :3] @ u)), float(np.sqrt(v @ covariance[3:, 3:] @ v))
-            moved = f"{1e3 * length:.1f} +/- {1e3 * sigmas[1]:.1f} mm"
-            turned = f"{np.degrees(angle):.2f} +/- {np.degrees(sigmas[0]):.2f} deg"
-        mount = self._rig.mount
-        tied = mount is not None and mount.board == sheet.board.id
-        void = "; the mount (f_T_b) holds for the time before only" if tied else ""
-        text = (
-            f"board {sheet.board.id} was knocked between {1e-9 * knock.before_ns:.2f} s and "
-            f"{1e-9 * knock.after_ns:.2f} s: moved by {moved}, turned by {turned}; it has a new pose from then on{void}"
-        )
-        values = {
-            "before_ns": float(knock.before_ns),
-            "moved_m": length,
-            "moved_sigma_m": sigmas[1],
-            "turned_rad": angle,
-            "turned_sigma_rad": sigmas[0],
-        }
-        name = f"{sheet.board.id} {knock.epoch}"
-        self.say(knock.after_ns, "board_knocked", name, text, "warning", **values)
-
-
-def side_words(board: str) -> str:
-    """The side prior's name in the records."""
-    return f"side of board {board}"
-
-
-def scale_words(board: str) -> str:
-    """The print scale prior's name in the records."""
-    return f"print scale of board {board}"
-
-
-def _rejection(sheet: Sheet, s: MarkerSighting, reason: str, value: float, limit: float) -> Rejection:
-    what = f"marker {s.marker} of board {sheet.board.id} in {s.camera}"
-    return Rejection(s.stamp_ns, FAMILY, what, reason, float(value), float(limit))

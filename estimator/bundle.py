@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ..factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
+from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,6 +18,8 @@ class Bundle:
     """Surface depth and its sigma under the picks of this stamp, by point id, where it could be measured."""
     outlines: tuple[OutlineSighting, ...] = ()
     cloud: CloudFrame | None = None
+    cylinders: tuple[CylinderSighting, ...] = ()
+    """Pipes in the cloud, where they were looked for elsewhere."""
 
 
 def bundles(measurements: Sequence[object]) -> list[Bundle]:
@@ -41,4 +43,5 @@ def _bundle(stamp_ns: int, group: list[object]) -> Bundle:
         {},
         of(OutlineSighting),
         clouds[0] if clouds else None,
+        of(CylinderSighting),
     )

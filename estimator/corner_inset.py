@@ -80,7 +80,7 @@ def inset_directions(
     log: FactorLog, active: Active, system: LinearSystem, values: gtsam.Values, boards: Boards
 ) -> tuple[list[tuple[str, str]], Float, csr_matrix]:
     """Names, prior sigmas and whitened directions (rows, k) of all insets."""
-    names = sorted(boards.inset_sigma_px)
+    names = sorted(boards.corners.inset_sigma_px)
     rays = CornerRays(log, values)
     rows, columns, data = [], [], []
     factor: Any
@@ -96,7 +96,7 @@ def inset_directions(
         columns += [names.index((camera, board))] * 2
         data += list(-weight * model.unweightedWhiten(rays.of(factor, record)))
     C = csr_matrix((data, (rows, columns)), shape=(len(system.b), len(names)))
-    return names, np.array([boards.inset_sigma_px[n] for n in names]), C
+    return names, np.array([boards.corners.inset_sigma_px[n] for n in names]), C
 
 
 def corrected_corners(

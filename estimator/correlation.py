@@ -91,7 +91,7 @@ def _design_effect(
     influence = system.A @ system.solve(np.hstack(right))
     alone = (np.asarray(found.T @ influence) ** 2).sum(axis=0)
     own = tracks.gather(system, influence).sum(axis=1)
-    shared = np.zeros_like(alone)
+    shared = np.zeros(len(alone))
     for image, kernel in zip(tracks.images, tracks.kernels, strict=True):
         for axis in range(2):
             shared += neighbours[axis] * (own[image, axis] * (kernel @ own[image, axis])).sum(axis=0)
@@ -117,7 +117,7 @@ def root(tracks: "Tracks", system: LinearSystem, variances: Float) -> csr_matrix
         if seen.tobytes() not in known:
             at = np.flatnonzero(seen)
             own = covariance[:, at[:, None], at]
-            known[seen.tobytes()] = np.asarray(np.linalg.cholesky(own), np.float64)
+            known[seen.tobytes()] = np.asarray(np.linalg.cholesky(own), dtype=np.float64)
         for axis, factor in enumerate(known[seen.tobytes()]):
             i.append(np.repeat(rows + axis, len(rows)))
             j.append(np.tile(rows + axis, len(rows)))

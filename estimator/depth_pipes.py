@@ -113,6 +113,10 @@ class DepthPipes:
         if isinstance(found, Rejection):
             self.refused[pipe, base] = found
             return update
+        if pipe not in self.wanted(base):
+            reason = "the pipe or {b} has no place, or a cloud has shown the pipe already"
+            self.refused[pipe, base] = Rejection(found.stamp_ns, FAMILY, f"{pipe} in the cloud", reason, 0.0, 1.0)
+            return update
         index = self._pipes.cylinders[pipe].index
         covariance = cylinder_covariance(found)
         trial = cylinder_factor(found, gaussian(np.eye(5)), base, index)

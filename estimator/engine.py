@@ -83,6 +83,7 @@ class Engine:
         self.solver = Incremental()
         sigma = rig.gates.robust_sigma
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
+        self.odometry.joint_covariance = self.solver.joint_covariance
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
@@ -136,6 +137,8 @@ class Engine:
             self._picks_of(bundle)
         for outline in bundle.outlines:
             self.add_outline(outline)
+        for cylinder in bundle.cylinders:
+            self.add_cylinder(cylinder.pipe_id, self.base, cylinder)
         urgent = bundle.frame is not None or bundle.picks or bundle.outlines or bundle.cloud is not None
         return self.flush() if urgent or self._unsolved >= MARKER_KEYFRAMES else False
 
@@ -357,6 +360,8 @@ class Engine:
         for track, index in self.odometry.seen_in.items():
             by_keyframe.setdefault(index, {})[track] = self.odometry.observations[track]
         for index, observations in by_keyframe.items():
+            if not self.state.has(keys.keyframe(index)):
+                continue  # it has left the graph
             pose = self.state.pose(keys.keyframe(index))
             self._take(self.surfaces.lay(self.base, pose, observations))
         self.events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
@@ -465,6 +470,7 @@ class Engine:
 
     def add_cylinder(self, pipe: str, base: int, found: CylinderSighting | Rejection) -> None:
         """A pipe in the Kinect's cloud of a station, or why it was not found; enters with the next update."""
+        self.flush()
         self._take(self.depth_pipes.add(found, pipe, base, self.solver))
 
     def lost_picks(self) -> list[Pick]:

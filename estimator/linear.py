@@ -116,7 +116,7 @@ class LinearSystem:
 
     def error_covariance(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Float:
         """Covariance (k, k) of the whitened errors of some rows (index or mask)."""
-        root = csr_matrix(identity(len(self.b)))[rows] if self.root is None else self.root[rows]
+        root = (csr_matrix(identity(len(self.b))) if self.root is None else self.root)[rows]
         return np.asarray((root @ root.T).todense())
 
     def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:

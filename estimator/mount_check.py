@@ -105,8 +105,7 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     start.update(base, pose3(placed.o_T_b))
     planes = _planes(found, cloud, base, start, engine.rig.gates.robust_sigma)
     kept = [i for i, (_, _, record) in enumerate(active) if record.family not in ("mount", CLOUD, CYLINDER)]
-    rows = np.concatenate([np.arange(system.starts[i], system.starts[i + 1]) for i in kept])
-    root = None if system.root is None else csr_matrix(system.root[rows][:, rows])
+    root = _root_of(system, kept)
     factors = [active[i][1] for i in kept] + planes
     factors.append(weak_pose_prior(base, start.atPose3(base), 1.0, 1.0))
     without = _system(factors, start, root)
@@ -130,6 +129,14 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     )  # fmt: skip
 
 
+def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
+    """The part of the errors' correlation that belongs to some factors."""
+    if system.root is None:
+        return None
+    rows = np.concatenate([np.arange(system.starts[i], system.starts[i + 1]) for i in kept])
+    return csr_matrix(system.root[rows][:, rows])
+
+
 def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, root: csr_matrix | None) -> LinearSystem:
     """The linear system of factors, the first rows' errors as correlated as in the full one."""
     graph = gtsam.NonlinearFactorGraph()
@@ -137,8 +144,8 @@ def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, root: cs
         graph.add(factor)
     system = LinearSystem(graph, values)
     if root is not None:
-        more = len(system.b) - int(root.indptr.size - 1)
-        system.root = csr_matrix(block_diag((root, identity(more)))) if more else root
+        rest = len(system.b) - root.indptr.size + 1
+        system.root = csr_matrix(block_diag((root, identity(rest))))
     return system
 
 

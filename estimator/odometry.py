@@ -1,5 +1,6 @@
 """Stereo visual odometry in the graph: keyframes, and the landmarks that tie them together."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -17,6 +18,11 @@ from .graph import Record, State, Update
 Float = NDArray[np.float64]
 
 FAMILY = "stereo odometry"
+
+AWAY = 3
+"""Keyframes without a view after which a landmark counts as having come back."""
+DRIFT_SAMPLE = 5
+"""Landmarks that tell how large a drift the graph thinks possible."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +71,8 @@ class Odometry:
         self._since_keyframe_lost = False
         self._reference = -1
         """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
+        self.joint_covariance: Callable[[Sequence[int]], Float] | None = None
+        """Of the running solver; None refuses every landmark that comes back from far away."""
 
     @property
     def last_keyframe(self) -> int:
@@ -113,6 +121,7 @@ class Odometry:
         """These have left the graph."""
         self._waiting = {t: w for t, w in self._waiting.items() if w[0] not in keyframes}
         self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
+        self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
         self.frames = [f for f in self.frames if f.keyframe not in keyframes]
 
     def place(self, stamp_ns: int, index: int) -> None:
@@ -160,35 +169,82 @@ class Odometry:
         return known, new
 
     def _gated(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[list[int], list[Rejection]]:
-        """Leaves out tracks that are far from where the map and the common shift of all tracks put them."""
+        """Leaves out tracks that are far from where the map and the common shift of all tracks put them.
+
+        Landmarks that come back into view after a time show the drift since, which the living ones do not: they have
+        their own shift, and it has to be one that the drift can be.
+        """
+        newest = self._reference
+        ids = frame.track_ids
+        back = [r for r in rows if newest - self.seen_in.get(int(ids[r]), newest) >= AWAY]
+        living = sorted(set(rows) - set(back))
+        kept, rejected, shift = self._gated_together(frame, living, pose)
+        again, more, drift = self._gated_together(frame, back, pose)
+        excess = float(np.linalg.norm(drift - shift))
+        if again and not self._since_keyframe_lost and excess > self._settings.gate_px:
+            sigmas = self._drift_sigmas(frame, again, pose, shift)
+            if sigmas > self._settings.gate_sigma:
+                reason = "seen again, beyond what drift explains, sigmas"
+                more += [self._refused(frame, r, reason, sigmas, self._settings.gate_sigma) for r in again]
+                again = []
+        return kept + again, rejected + more
+
+    @staticmethod
+    def _refused(frame: StereoFrame, row: int, reason: str, value: float, limit: float) -> Rejection:
+        what = f"track {int(frame.track_ids[row])} in m_left"
+        return Rejection(frame.stamp_ns, FAMILY, what, reason, value, limit)
+
+    def _gated_together(
+        self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3
+    ) -> tuple[list[int], list[Rejection], Float]:
+        """Rows that have about the same residual, what does not, and that residual, px."""
         if not rows:
-            return rows, []
-        points = np.array([self._state.point(keys.landmark(int(frame.track_ids[r]))) for r in rows])
-        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
-        c_p = (points - pose.translation()) @ pose.rotation().matrix()
-        front = c_p[:, 2] > 0.05
-        px = (c_p @ K.T)[:, :2] / np.where(front, c_p[:, 2], 1.0)[:, None]
-        residual = frame.left_px[rows] - px
+            return rows, [], np.zeros(2)
+        residual, front = self._residuals(frame, rows, pose)
         shift = np.median(residual[front], axis=0) if front.any() else np.zeros(2)
-        residual = residual - shift
-        distance = np.linalg.norm(residual, axis=1)
+        distance = np.linalg.norm(residual - shift, axis=1)
         spread = np.maximum(1.4826 * float(np.median(distance)), 0.0)
         sigma = np.sqrt(np.trace(frame.left_covariance_px2[rows], axis1=1, axis2=2) / 2)
         limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
         good = front & (distance < limit)
         rejected = [
-            Rejection(
-                frame.stamp_ns,
-                FAMILY,
-                f"track {int(frame.track_ids[r])} in m_left",
-                "off its landmark by px",
-                float(distance[i]),
-                float(limit[i]),
-            )
+            self._refused(frame, r, "off its landmark by px", float(distance[i]), float(limit[i]))
             for i, r in enumerate(rows)
             if not good[i]
         ]
-        return [r for i, r in enumerate(rows) if good[i]], rejected
+        return [r for i, r in enumerate(rows) if good[i]], rejected, shift
+
+    def _residuals(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[Float, NDArray[np.bool_]]:
+        """Left pixels less those of the landmarks seen from a pose, (n, 2), and which are ahead of the camera."""
+        points = np.array([self._state.point(keys.landmark(int(frame.track_ids[r]))) for r in rows])
+        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
+        c_p = (points - pose.translation()) @ pose.rotation().matrix()
+        front = c_p[:, 2] > 0.05
+        px = (c_p @ K.T)[:, :2] / np.where(front, c_p[:, 2], 1.0)[:, None]
+        return frame.left_px[rows] - px, front
+
+    def _drift_sigmas(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3, shift: Float) -> float:
+        """How far landmarks that came back are from where they should be, in sigmas of the graph's own joint.
+
+        The median over a few of them: they share the drift. What the living tracks show too is the pose's guess.
+        """
+        last = keys.keyframe(self._reference)
+        if self.joint_covariance is None or not self._state.has(last):
+            return float("inf")
+        to_last = self._state.pose(last).between(pose).inverse().AdjointMap()
+        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
+        chosen = rows[:: max(len(rows) // DRIFT_SAMPLE, 1)]
+        residual = self._residuals(frame, chosen, pose)[0] - shift
+        found = []
+        for r, off in zip(chosen, residual, strict=True):
+            landmark = keys.landmark(int(frame.track_ids[r]))
+            x, y, z = c_p = pose.transformTo(self._state.point(landmark))
+            by_point = K[:2, :2] @ np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
+            by_pose = np.hstack([by_point @ gtsam.Rot3.Hat(c_p), -by_point]) @ to_last
+            J = np.hstack([by_pose, by_point @ pose.rotation().matrix().T])
+            covariance = J @ self.joint_covariance([last, landmark]) @ J.T + frame.left_covariance_px2[r]
+            found.append(np.sqrt(off @ np.linalg.solve(covariance, off)))
+        return float(np.median(found))
 
     def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
@@ -218,7 +274,7 @@ class Odometry:
             record = Record(FAMILY, f"tracks {camera}", frame.stamp_ns, f"track {track} in {camera}", camera=camera)
             update.add(mobile_projection(camera, px, model, pose, point), record)
         self.observations[track] = self.observations.get(track, 0) + 1
-        self.seen_in[track] = index
+        self.seen_in[track] = max(index, self.seen_in.get(track, index))
 
     def _create(self, update: Update, frame: StereoFrame, rows: list[int], index: int, pose: gtsam.Pose3) -> None:
         """New landmarks from tracks seen in an earlier keyframe too; others wait for their second one."""

@@ -24,7 +24,7 @@ from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
 from .batch import BatchSolution
-from .boards import FAMILY as CORNERS
+from .board_inspection import FAMILY as CORNERS
 from .consistency import family_tests, judge, prior_tests
 from .engine import NOMINAL_DEPTH_FOCAL_PX, Engine, distance_name
 from .marker_points import parse_point

@@ -10,10 +10,10 @@ import numpy as np
 
 from ..estimator.baseline import ClickedPoint
 from ..factors.camera import CameraModel
-from ..factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
+from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
 from .measurement_level_board import misprinted
-from .measurement_level_machine import clicks, cloud_frames, stereo_clicks
+from .measurement_level_machine import clicks, cloud_frames, cylinders, stereo_clicks
 from .measurement_level_mobile import marker_sightings, stereo_frames
 from .measurement_level_scenario import Scenario, merged
 from .measurement_level_scene import Scene, build_scene, mobile_path
@@ -30,7 +30,7 @@ from .measurement_level_truth import (
 )
 from .measurement_level_world import World
 
-Measurement = MarkerSighting | StereoFrame | CloudFrame | Pick | OutlineSighting
+Measurement = MarkerSighting | StereoFrame | CloudFrame | CylinderSighting | Pick | OutlineSighting
 START_NS = 1_000_000_000
 COLOUR_SIZE = (640, 480)
 
@@ -55,9 +55,10 @@ def draw(scenario: Scenario, seed: int) -> Run:
         *stereo_frames(world),
         *marker_sightings(world),
         *cloud_frames(world),
+        *cylinders(world),
         *clicks(world),
     ]
-    order = {StereoFrame: 0, MarkerSighting: 1, CloudFrame: 2, OutlineSighting: 3, Pick: 4}
+    order = {StereoFrame: 0, MarkerSighting: 1, CloudFrame: 2, OutlineSighting: 3, Pick: 4, CylinderSighting: 5}
     measurements.sort(key=lambda measurement: (measurement.stamp_ns, order[type(measurement)]))
     cameras = {name: _model(camera, scenario.baseline_m) for name, camera in world.nominal.items()}
     picks = [measurement for measurement in measurements if isinstance(measurement, Pick)]

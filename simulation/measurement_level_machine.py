@@ -4,13 +4,18 @@ import numpy as np
 
 from ..estimator.baseline import ClickedPoint
 from ..estimator.pipes import EDGE_FLOOR_PX
-from ..factors.measurements import CloudFrame, OutlineSighting, Pick
+from ..factors.cloud import depth_moves
+from ..factors.measurements import CloudFrame, CylinderSighting, OutlineSighting, Pick
 from ..factors.outline import outline_lines
+from ..factors.pipe import across_axis
+from ..frontends.cloud.noise import SMOOTH_SHARE
 from .measurement_level_scene import cast, occluded
 from .measurement_level_truth import KINECT_FOCAL_PX, Float, invert, transform
 from .measurement_level_world import World, inside, project, spoil
 
 KINECT_SIZE = (640, 480)
+CYLINDER_ACROSS_SIGMA_M, CYLINDER_RADIUS_SIGMA_M = 0.0005, 0.0008
+"""What fits to rendered clouds at 1.5 to 2 m state; along the view the depth camera's own errors decide."""
 MATCH_SIGMA_PX = 0.25
 """Disparity error of semi-global matching at a window's median."""
 
@@ -52,6 +57,40 @@ def _cloud_frame(world: World, stamp_ns: int, count: int, rng: np.random.Generat
         planarity_m=sigma_m,
         bias_m=np.zeros(len(sigma_m)),
     )
+
+
+def cylinders(world: World) -> list[CylinderSighting]:
+    """The pipe as fitted to the Kinect's cloud, where nothing hides it; at the end, when the pipe is known."""
+    if world.scenario.clouds.frames == 0 or not world.scenario.clouds.cylinder:
+        return []
+    pipe, b_T_w = world.scene.pipe, invert(world.scene.w_T_b)
+    ends_w = pipe.base + np.array([[0.8], [1.5]]) * pipe.axis
+    eyes = np.tile(world.scene.w_T_b[:3, 3], (2, 1))
+    if occluded(eyes, ends_w, world.scene.surfaces).any():
+        return []
+    ends = transform(b_T_w, ends_w)
+    across = across_axis(b_T_w[:3, :3] @ pipe.axis)
+    E = np.zeros((7, 5))
+    E[:3, :2] = E[3:6, 2:4] = across.T
+    E[6, 4] = 1.0
+    covariance = np.diag([0.0, 0.0, 0.0, 0.0, CYLINDER_RADIUS_SIGMA_M**2])
+    for i, end in enumerate(ends):
+        view = across @ (end / np.linalg.norm(end))
+        along = np.hypot(kinect_sigma_m(end[2]), SMOOTH_SHARE * end[2])
+        rows = slice(2 * i, 2 * i + 2)
+        covariance[rows, rows] = CYLINDER_ACROSS_SIGMA_M**2 * np.eye(2) + along**2 * np.outer(view, view)
+    response = np.vstack([*depth_moves(ends), np.zeros((1, 5))])
+    true = world.true
+    states = np.array([true.depth_offset_m, true.depth_scale, *true.depth_rays])
+    noise = world.rng.spawn(1)[0].multivariate_normal(np.zeros(5), covariance) * world.scenario.noise_factors.clouds
+    fitted = np.array([*ends[0], *ends[1], pipe.radius_m]) - response @ states + E @ noise
+    information = E @ np.linalg.inv(covariance) @ E.T
+    return [
+        CylinderSighting(
+            world.stamps_ns[-1], "b_depth", world.rig.pipes[0].id, fitted[:3], fitted[3:6], float(fitted[6]),
+            information, 3000, 0.0015, "kinect_cloud", response,
+        )
+    ]  # fmt: skip
 
 
 def kinect_sigma_m(depth_m: Float) -> Float:

@@ -89,6 +89,8 @@ class Clouds(Section):
 
     frames: Count = 2
     points: Count = 2000
+    cylinder: bool = True
+    """The pipe is found in the cloud, where the Kinect sees it."""
 
 
 class Picks(Section):

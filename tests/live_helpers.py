@@ -39,7 +39,7 @@ class Collector:
         return Counter(message.topic for message in self.messages)
 
 
-def wait_for(condition: Callable[[], Any], timeout_s: float = 10.0) -> None:
+def wait_for(condition: Callable[[], Any], timeout_s: float = 30.0) -> None:
     """Until the condition holds; fails the test when it does not come true."""
     end = time.monotonic() + timeout_s
     while not condition():

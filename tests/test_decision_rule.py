@@ -6,9 +6,10 @@ from report_results import AXIS, SECOND, make_consistency, make_point, make_pose
 from scipy.special import ndtr, ndtri
 from scipy.stats import chi
 
+from surecut.estimator import validated_range
 from surecut.estimator.decision import along_room_m, decide, decide_cut, percent, tolerance_probability
 from surecut.estimator.result import NearestSurface, PipeEstimate
-from surecut.estimator.validated_range import ValidatedRange, load_validated_range, range_text
+from surecut.estimator.validated_range import QUANTITIES, ValidatedRange, load_validated_range, range_text
 from surecut.factors.errors import SurecutError
 from surecut.factors.measurements import Event
 from surecut.factors.rig import Box, Cut
@@ -273,3 +274,17 @@ def test_validated_range_file(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(SurecutError, match="cannot be read"):
         load_validated_range(tmp_path / "none.yaml")
+
+
+def test_the_range_that_comes_along_is_as_its_campaign_wrote_it():
+    validated = load_validated_range()
+    assert validated is not None
+    assert validated.runs >= 100
+    assert 0.935 <= validated.coverage95 <= 0.97
+    assert set(validated.ranges) == set(QUANTITIES)
+
+
+def test_without_the_range_that_comes_along_there_is_no_go(tmp_path, monkeypatch):
+    monkeypatch.setattr(validated_range.resources, "files", lambda package: tmp_path)
+    assert load_validated_range() is None
+    assert decision(validated=load_validated_range()).verdict == "MEASURE MORE"

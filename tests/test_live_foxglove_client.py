@@ -149,8 +149,21 @@ def test_a_server_that_goes_and_comes_is_found_again():
         wait_for(lambda: not source.connected())
     begun = time.monotonic()
     source.stop()
-    assert time.monotonic() - begun < 2
+    assert time.monotonic() - begun < 5
     assert source.ended()
+
+
+def test_an_image_is_asked_for_in_one_form():
+    zipped = "sensor_msgs/msg/CompressedImage"
+    channels = [
+        ros_channel(1, "/m/left/image_raw/compressed", zipped),
+        ros_channel(2, "/m/left/image_raw", IMAGE),
+        ros_channel(3, "/m/right/image_raw/compressed", zipped),
+    ]
+    with Robot(channels) as robot:
+        source, _ = client(robot.port, expected=expected_bodies(RIG))
+        wait_for(lambda: set(robot.subscribed) == {2, 3})
+        source.stop()
 
 
 def test_a_type_that_nobody_needs_is_not_asked_for():
@@ -172,7 +185,7 @@ def test_the_definition_of_a_stranger_is_never_compiled(monkeypatch):
         source, _ = client(robot.port)
         wait_for(lambda: 3 in robot.subscribed)
         source.stop()
-        assert time.monotonic() - begun < 5
+        assert time.monotonic() - begun < 20
     assert source.counters()["unknown_encoding"] == 1
 
 

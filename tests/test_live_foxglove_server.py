@@ -275,7 +275,7 @@ def test_a_stalled_viewer_loses_the_oldest_and_holds_up_nobody():
                 longest = max(longest, time.monotonic() - begun)
                 time.sleep(0.005)
             wait_for(lambda: lively.data and lively.data[-1][1] == 100)
-            assert longest < 0.1
+            assert longest < 1.0
             assert server.counters()["dropped"] > 10
             assert len(lively.data) > 50
 

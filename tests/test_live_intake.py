@@ -20,9 +20,11 @@ from live_bad_input import (
     RIG,
     SECOND,
     START,
+    ZIP,
     Case,
     channel,
     cloud,
+    compressed,
     image,
     info,
     pick,
@@ -119,6 +121,21 @@ def test_a_click_in_an_old_image_and_a_calibration_of_long_ago_are_let_in():
         intake.take(channel("/m/left/camera_info", INFO), info())
         now += 20 * SECOND
     assert [message.stamp_ns for message in found.messages] == [START, 0, 0, 0]
+
+
+def test_an_image_in_two_forms_is_taken_once():
+    now = START
+    intake, found = Intake(lambda: now, expected_bodies(RIG)), Collector()
+    intake.open(found)
+    small = compressed(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes())
+    second = channel(LEFT + "/compressed", ZIP)
+    intake.take(second, small)
+    intake.take(channel(LEFT, IMAGE), image())
+    intake.take(second, small)
+    now += 3 * SECOND  # the other form has ended
+    intake.take(second, small)
+    assert [message.topic.endswith("/compressed") for message in found.messages] == [True, False, True]
+    assert intake.counters()["redundant"] == 1
 
 
 def test_scattered_stamps_are_never_believed():

@@ -108,7 +108,7 @@ def test_a_server_that_says_nothing_does_not_hold_up_the_end():
         wait_for(source.connected)
         begun = time.monotonic()
         source.stop()
-        assert time.monotonic() - begun < 1.5
+        assert time.monotonic() - begun < 5
         assert source.ended()
         hold.set()
 

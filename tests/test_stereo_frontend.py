@@ -6,6 +6,8 @@ import pytest
 from stereo_scene import BASELINE, HEIGHT, WIDTH, K, Room, camera, expose, left_T_right, pose, texture
 
 from surecut.frontends.stereo.frontend import StereoFrontEnd
+from surecut.frontends.stereo.geometry import exponential
+from surecut.frontends.stereo.settings import StereoSettings
 from surecut.frontends.undistort import undistort
 
 STEP_NS = 50_000_000
@@ -283,6 +285,25 @@ def test_a_place_seen_again_continues_old_tracks(rendered):
     assert outliers < 0.01
     assert rows[:, 2].sum() / rows[:, 3].sum() < 1.6
     assert errors(frames, poses)[-1, 0] < 0.008
+
+
+def test_a_loop_is_closed_after_a_drift(rendered):
+    """The chain is put 0.4 m and 5 degrees off on the way: the way back is found by the place, not by the chain."""
+    _, pairs = rendered
+    order = [*range(40), *range(39, -1, -1)]
+    front = StereoFrontEnd(camera(), camera("m_right"), left_T_right(), StereoSettings(loop_ns=1_500_000_000))
+    first = run([pairs[i] for i in order[:45]], front=front)
+    before = {i for frame in first[:25] for i in frame.track_ids.tolist()}
+    front._chain_T_keyframe = front._chain_T_keyframe @ exponential(np.array([0.0, 0.09, 0.0, 0.3, 0.1, -0.25]))
+    front.places._places = [place for place in front.places._places if place.stamp_ns < 40 * STEP_NS]
+    rng = np.random.default_rng(8)
+    again = [
+        front.process(i * STEP_NS, expose(pairs[order[i]][0], rng), expose(pairs[order[i]][1], rng))
+        for i in range(46, len(order))
+    ]
+    assert not any(frame.lost for frame in again)
+    living = set(first[-1].track_ids.tolist())
+    assert len((before - living) & {i for frame in again for i in frame.track_ids.tolist()}) > 30
 
 
 def test_landmarks_are_matched_where_an_estimate_expects_them(rendered):

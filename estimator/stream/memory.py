@@ -99,7 +99,7 @@ def remember(engine: Engine) -> Memory | None:
         ],
         mounted=engine.mounted,
         distances_open=[engine.rig.distances.index(d) for d in engine.distances_open],
-        inset_sigma_px=[(*key, sigma) for key, sigma in engine.boards.inset_sigma_px.items()],
+        inset_sigma_px=[(*key, sigma) for key, sigma in engine.boards.corners.inset_sigma_px.items()],
         cylinders=sorted(_seen_by_machine(engine)),
     )
 
@@ -130,7 +130,7 @@ def recall(engine: Engine, memory: Memory) -> None:
     used = [slot for sheet in engine.boards.sheets.values() for slot in sheet.slots.values()]
     corners = [keys.index(k) // 4 for k in memory.prior.keys if keys.kind(k) == "q"]
     engine.boards.begin_slots(max([*used, *corners], default=-1) + 1)
-    engine.boards.inset_sigma_px = {(c, b): s for c, b, s in memory.inset_sigma_px}
+    engine.boards.corners.inset_sigma_px = {(c, b): s for c, b, s in memory.inset_sigma_px}
     for stored in memory.points:
         engine.pipes.points[stored["name"]] = known_point(**stored)
     for stored in memory.pipes:

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 
@@ -68,3 +69,10 @@ def _spread(
                 break
             cv2.circle(free, (x, y), radius, 0, -1)
     return np.array(chosen, dtype=np.float64).reshape(-1, 2)
+
+
+def apart(px: Float, others: Float, distance_px: float) -> Bool:
+    """Which of px (n, 2) keep a distance from all others (m, 2)."""
+    if len(others) == 0:
+        return np.ones(len(px), dtype=bool)
+    return (np.linalg.norm(px[:, None] - others[None], axis=2) > distance_px).all(axis=1)

@@ -7,7 +7,7 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import StereoFrame
 from ..undistort import distort, undistort
 from . import points
-from .detection import detect
+from .detection import apart, detect
 from .flow import checked_flow, inside
 from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, project, transform
 from .keyframes import keyframe_reason
@@ -269,10 +269,11 @@ class StereoFrontEnd:
     def _fill(self, view: Keyview, sighting: Sighting, last_T_this: Float, inliers: int, lost: bool) -> StereoFrame:
         """Adds landmarks seen again and new corners, and delivers the keyframe."""
         settings, tracks = self.settings, self._tracks
-        rows = self.landmarks.in_view(self._chain_T_keyframe, self.rig, settings.revisits)
-        found, seen, correction = self._revisit(view, rows.rows)
+        found, seen, correction = self._seen_again(view)
         self._correct_chain(correction)
-        free = _apart(tracks.raw_px, found.raw_px, 0.4 * self._spacing)
+        if len(found) == 0:
+            found, seen = self._close_loop(view)
+        free = apart(tracks.raw_px, found.raw_px, 0.4 * self._spacing)
         tracks.keep(free)
         sighting = sighting.take(free).append(seen)
         tracks.extend(found)
@@ -299,6 +300,30 @@ class StereoFrontEnd:
         return revisit(
             view, self.landmarks, rows, self._chain_T_keyframe, self._observer, self.rig, self._vertical, self.settings
         )
+
+    def _seen_again(self, view: Keyview) -> tuple[Tracks, Sighting, Float]:
+        """Old landmarks where the chain expects them."""
+        rows = self.landmarks.in_view(self._chain_T_keyframe, self.rig, self.settings.revisits)
+        return self._revisit(view, rows.rows)
+
+    def _close_loop(self, view: Keyview) -> tuple[Tracks, Sighting]:
+        """Landmarks of a place from long before, when the chain has drifted so far that it does not find them.
+
+        The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
+        """
+        nothing = no_tracks(self._observer.grid), nothing_seen()
+        before_ns = view.pair.stamp_ns - self.settings.loop_ns
+        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation)
+        if found is None:
+            return nothing
+        drifted = self._chain_T_keyframe
+        self._chain_T_keyframe = self.places.chain_pose(found.stamp_ns) @ found.keyframe_T_this
+        tracks, seen, correction = self._seen_again(view)
+        if len(tracks) < self.settings.min_inliers:
+            self._chain_T_keyframe = drifted
+            return nothing
+        self._correct_chain(correction)
+        return tracks, seen
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
         """Takes up the drift that landmarks seen again show; the points of living tracks are relative and stay."""
@@ -366,10 +391,3 @@ def _blind(stamp_ns: int, last_T_this: Float) -> StereoFrame:
         motion_inliers=0,
         lost=True,
     )
-
-
-def _apart(px: Float, others: Float, distance_px: float) -> Bool:
-    """Which of px (n, 2) keep a distance from all others (m, 2)."""
-    if len(others) == 0:
-        return np.ones(len(px), dtype=bool)
-    return (np.linalg.norm(px[:, None] - others[None], axis=2) > distance_px).all(axis=1)

@@ -17,6 +17,8 @@ from .motion import estimate_motion
 from .tracks import Int
 
 _TRIED = 8
+_ALIKE = 0.8
+"""Correlation of thumbnails from which on a place is worth a look while nobody is lost."""
 _THUMBNAIL = (40, 30)
 
 
@@ -107,6 +109,25 @@ class PlaceStore:
             if match is not None:
                 found.append(match)
         return sorted(found, key=lambda match: -match.inliers)
+
+    def look_back(self, left: Image, before_ns: int, min_inliers: int) -> Relocalisation | None:
+        """The one place of before that looks most like the left image, if it does and the features agree.
+
+        Cheap where nothing looks alike: only thumbnails are compared then.
+        """
+        old = [place for place in self._places if place.stamp_ns < before_ns]
+        if not old:
+            return None
+        picture = _thumbnail(left).ravel()
+        likeness = np.array([float(place.thumbnail.ravel() @ picture) for place in old])
+        best = int(np.argmax(likeness))
+        if likeness[best] < _ALIKE:
+            return None
+        keypoints, descriptors = self._orb.detectAndCompute(left, None)
+        if descriptors is None or len(keypoints) < min_inliers:
+            return None
+        raw = np.array([point.pt for point in keypoints], dtype=np.float64)
+        return self._verify(old[best], raw, np.asarray(descriptors, np.uint8), min_inliers)
 
     def _describe(self, place: Place) -> tuple[Image, NDArray[np.intp]]:
         """Descriptors at the place's landmarks; those too near the rim have none."""

@@ -40,6 +40,8 @@ class StereoSettings:
     """Smallest standard deviation of the inliers, in the direction of least spread, as a share of the diagonal."""
     min_relocalisation: int = 15
     """Inliers that a remembered place needs to count as found again."""
+    loop_ns: int = 10_000_000_000
+    """Age of a place that the camera may come back to without its landmarks being found by themselves."""
     revisits: int = 40
     """Number of old landmarks that each keyframe looks for."""
     store_keyframes: int = 400

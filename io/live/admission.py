@@ -23,6 +23,8 @@ from ..messages import (
 from ..pixels import CompressedPixels
 from .sniff import image_size
 
+COMPRESSED = ("/compressedDepth", "/compressed")
+"""What image_transport appends to the topic of an image for its other forms."""
 Expected = Mapping[str, tuple[type[Body], ...]]
 """What may come on a topic. Topics that are not in it are not wanted."""
 
@@ -89,6 +91,8 @@ class Admission:
             return "wrong_type"
         if not _is_finite(message.body):
             return "not_finite"
+        if self._is_second_form(message, received_ns):
+            return "redundant"
         known = self._topics.get(message.topic)
         if known is None:
             if len(self._topics) >= self._limits.channels:
@@ -100,6 +104,14 @@ class Admission:
             or self._size(known, message.body)
             or _calibration(known, message.body)
         )
+
+    def _is_second_form(self, message: Message, received_ns: int) -> bool:
+        """Whether the same image comes uncompressed too."""
+        plain = plain_topic(message.topic)
+        if plain == message.topic or not isinstance(message.body, ImageBody | DepthBody):
+            return False
+        known = self._topics.get(plain)
+        return known is not None and 0 <= received_ns - known.heard_ns < self._limits.sender_silence_ns
 
     def _sender(self, known: _Topic, body: Body, sender: str, received_ns: int) -> str | None:
         """Two cameras on one topic would be taken for one that leaps to and fro."""
@@ -149,6 +161,13 @@ class Admission:
             return "oversized" if min(size) > 0 else "malformed"
         known.size = known.size or size
         return None if size == known.size else "size_changed"
+
+
+def plain_topic(topic: str) -> str:
+    """The topic of the uncompressed form of an image."""
+    for suffix in COMPRESSED:
+        topic = topic.removesuffix(suffix)
+    return topic
 
 
 def _calibration(known: _Topic, body: Body) -> str | None:

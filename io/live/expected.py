@@ -2,10 +2,9 @@
 
 from ...factors.rig import Rig
 from ..messages import Body, CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, PickBody
-from .admission import Expected
+from .admission import COMPRESSED, Expected
 
-COMPRESSED = "/compressed"
-COMPRESSED_DEPTH = "/compressedDepth"
+_DEPTH, _IMAGE = COMPRESSED
 
 
 def expected_bodies(rig: Rig) -> Expected:
@@ -14,11 +13,11 @@ def expected_bodies(rig: Rig) -> Expected:
     expected: dict[str, tuple[type[Body], ...]] = {rig.picks_topic: (PickBody,), rig.kinect.points_topic: (CloudBody,)}
     for camera in (cameras.m_left, cameras.m_right, cameras.b_rgb):
         expected[camera.image_topic] = (ImageBody,)
-        expected[camera.image_topic + COMPRESSED] = (ImageBody,)
+        expected[camera.image_topic + _IMAGE] = (ImageBody,)
         if camera.markers_topic:
             expected[camera.markers_topic] = (DetectionsBody,)
     depth = cameras.b_depth.image_topic
-    expected[depth] = expected[depth + COMPRESSED] = expected[depth + COMPRESSED_DEPTH] = (DepthBody,)
+    expected[depth] = expected[depth + _IMAGE] = expected[depth + _DEPTH] = (DepthBody,)
     for camera in (cameras.m_left, cameras.m_right, cameras.b_rgb, cameras.b_depth):
         expected[camera.info_topic] = (CameraInfoBody,)
     return expected

@@ -14,7 +14,7 @@ from websockets.typing import Subprotocol
 
 from ...factors.errors import LogError
 from ..decode import ChannelInfo
-from .admission import Expected, Limits
+from .admission import Expected, Limits, plain_topic
 from .backoff import Backoff
 from .intake import Intake
 from .interfaces import Clock, Deliver
@@ -174,12 +174,17 @@ class FoxgloveClient:
 
     def _advertised(self, connection: ClientConnection, channels: object) -> None:
         wanted = []
-        for value in channels if isinstance(channels, list) else [None]:
-            found = _channel(value)
+        described = [_channel(value) for value in (channels if isinstance(channels, list) else [None])]
+        topics = {found[1].topic for found in described if found is not None and self._intake.wanted(found[1].topic)}
+        topics |= {channel.topic for channel in self._channels.values()}
+        for found in described:
             if found is None:
                 self._intake.refuse("malformed", None, "a channel that is not described as the protocol asks for")
                 continue
             number, channel = found
+            plain = plain_topic(channel.topic)
+            if plain != channel.topic and plain in topics:
+                continue  # the same image once is enough
             if len(self._channels) < self._intake.limits.channels and self._intake.accepts(channel):
                 self._channels[number] = channel
                 wanted.append({"id": number, "channelId": number})

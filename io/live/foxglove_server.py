@@ -5,6 +5,7 @@ Speaks `foxglove.sdk.v1` and the older `foxglove.websocket.v1`. Commands arrive 
 """
 
 import asyncio
+import contextlib
 import logging
 import re
 import struct
@@ -27,6 +28,7 @@ from .outbox import Outbox
 from .tally import Tally
 
 MAXIMUM_INBOUND = 64 << 10
+_CLOSE_S = 3.0
 _ORIGINS: tuple[Origin | re.Pattern[str] | None, ...] = (
     None,  # programs; browsers always name an origin
     Origin("https://app.foxglove.dev"),
@@ -119,7 +121,8 @@ class FoxgloveServer:
         self._outbox.stop()
         server, self._server = self._server, None
         if server is not None:
-            self._loop.run(self._close(server))
+            with contextlib.suppress(TimeoutError):  # whoever does not let go is left behind
+                self._loop.run(self._close(server), _CLOSE_S)
         self._loop.stop()
 
     def counters(self) -> Mapping[str, int]:

@@ -65,8 +65,8 @@ class Source(Protocol):
 
         Reasons: `malformed`, `oversized`, `ignored` (a topic that nobody asked for), `unknown_type`,
         `unknown_encoding`, `wrong_type`, `unstamped`, `stamp_outlier`, `size_changed`, `calibration_changed`,
-        `other_publisher`, `not_finite`; `reconnects` and `clock_jumps` tell of the link. A name may be absent until it
-        has happened.
+        `other_publisher`, `redundant` (an image that comes uncompressed too), `not_finite`, `dropped`; `reconnects`
+        and `clock_jumps` tell of the link. A name may be absent until it has happened.
         """
         ...
 

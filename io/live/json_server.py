@@ -21,6 +21,7 @@ from .tally import Tally
 from .views import json_object
 
 _SENDING = 64 << 10
+_CLOSE_S = 3.0
 _MAXIMUM_UNAUTHORISED = 5
 _MAXIMUM_MALFORMED = 100
 
@@ -93,7 +94,8 @@ class JsonServer:
         self._outbox.stop()
         server, self._server = self._server, None
         if server is not None:
-            self._loop.run(self._close(server))
+            with contextlib.suppress(TimeoutError):  # whoever does not let go is left behind
+                self._loop.run(self._close(server), _CLOSE_S)
         self._loop.stop()
 
     def counters(self) -> Mapping[str, int]:

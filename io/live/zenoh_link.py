@@ -22,6 +22,9 @@ _ATTACHMENT = struct.Struct("<qqB16s")
 _TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _ENDPOINT = re.compile(r"(tcp|tls|quic|unixsock-stream)/\S+")
 _OPEN_MS = 1000
+_NODE = "surecut"
+_QOS = "::,1:,:,:,,"
+"""Reliable, volatile, keep the last: rmw_zenoh's spelling of the defaults with depth 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,35 @@ def channel_of(topic: str, key: str) -> ChannelInfo:
     if parts[2] not in (own, UNKNOWN_HASH):
         raise LogError(f"{topic}: the sender's definition of {name} is another one than ROS 2's; update the sender")
     return ChannelInfo(topic, "cdr", name, "ros2msg", b"")
+
+
+class Announcements:
+    """What ROS 2's graph shall know of a session: the node, its publishers and subscriptions; while this lives.
+
+    Publishers that send only when somebody listens, as those of compressed images do, look there.
+    """
+
+    def __init__(self, session: zenoh.Session, domain: int) -> None:
+        self._session = session
+        self._domain = domain
+        self._tokens = [session.liveliness().declare_token(self._key("NN", 0))]
+
+    def publisher(self, topic: str, type_name: str) -> None:
+        """Raises KeyError when `schemas.typestore` does not know the type."""
+        self._endpoint("MP", topic, type_name)
+
+    def subscription(self, topic: str, type_name: str) -> None:
+        """Raises KeyError when `schemas.typestore` does not know the type."""
+        self._endpoint("MS", topic, type_name)
+
+    def _endpoint(self, kind: str, topic: str, type_name: str) -> None:
+        _, dds_type, digest = key_of(self._domain, topic, type_name).rsplit("/", 2)
+        what = f"{topic.replace('/', '%')}/{dds_type}/{digest}/{_QOS}"
+        key = f"{self._key(kind, len(self._tokens))}/{what}"
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    def _key(self, kind: str, number: int) -> str:
+        return f"@ros2_lv/{self._domain}/{self._session.info.zid()}/0/{number}/{kind}/%/%/{_NODE}"
 
 
 def open_session(router: str) -> zenoh.Session:

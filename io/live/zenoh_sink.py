@@ -14,11 +14,7 @@ from .interfaces import Clock, LiveImage, LiveUpdate, OnCommand
 from .outbox import Outbox
 from .tally import Tally
 from .views import ros_messages
-from .zenoh_link import DEFAULT_ROUTER, Attachment, check_router, key_of, open_session
-
-_NODE = "surecut"
-_QOS = "::,1:,:,:,,"
-"""Reliable, volatile, keep the last: rmw_zenoh's spelling of the defaults with depth 1."""
+from .zenoh_link import DEFAULT_ROUTER, Announcements, Attachment, check_router, key_of, open_session
 
 
 class ZenohSink:
@@ -38,7 +34,7 @@ class ZenohSink:
         self._tally = Tally()
         self._outbox = Outbox("surecut-zenoh-sink", self._send, self._tally)
         self._session: zenoh.Session | None = None
-        self._token: zenoh.LivelinessToken | None = None
+        self._announcements: Announcements | None = None
         self._publishers: dict[str, _Publisher] = {}
         self._stopping = threading.Event()
         self._linking: threading.Thread | None = None
@@ -80,7 +76,7 @@ class ZenohSink:
         while self._session is None:
             try:
                 session = open_session(self._router)
-                self._token = session.liveliness().declare_token(_announcement(session, self._domain))
+                self._announcements = Announcements(session, self._domain)
                 self._session, self._status = session, "connected"
             except (LogError, zenoh.ZError) as error:
                 self._status = str(error)
@@ -94,30 +90,26 @@ class ZenohSink:
         session = self._session
         if not isinstance(item, LiveUpdate):
             return
-        if session is None or not self._linked():
+        if session is None or self._announcements is None or not self._linked():
             self._tally.add("dropped")
             return
         for topic, type_name, message in ros_messages(item):
             publisher = self._publishers.get(topic)
             if publisher is None:
-                publisher = _Publisher(session, self._domain, topic, type_name, len(self._publishers) + 1)
+                publisher = _Publisher(session, key_of(self._domain, topic, type_name))
+                self._announcements.publisher(topic, type_name)
                 self._publishers[topic] = publisher
             publisher.put(bytes(typestore().serialize_cdr(message, type_name)), self._clock())
         self._tally.add("sent")
 
 
 class _Publisher:
-    """One topic, with what rmw_zenoh's subscribers ask for: an attachment per sample and a liveliness token."""
+    """One topic; rmw_zenoh's subscribers ask for an attachment with each sample."""
 
-    def __init__(self, session: zenoh.Session, domain: int, topic: str, type_name: str, number: int) -> None:
+    def __init__(self, session: zenoh.Session, key: str) -> None:
         self._publisher = session.declare_publisher(
-            key_of(domain, topic, type_name),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA,
+            key, congestion_control=zenoh.CongestionControl.DROP, priority=zenoh.Priority.DATA
         )
-        _, kind, digest = key_of(domain, topic, type_name).rsplit("/", 2)
-        what = f"{topic.replace('/', '%')}/{kind}/{digest}/{_QOS}"
-        self._token = session.liveliness().declare_token(_announcement(session, domain, number, "MP", what))
         self._gid = os.urandom(16)
         self._sequence = 0
 
@@ -125,9 +117,3 @@ class _Publisher:
         self._sequence += 1
         attachment = Attachment(self._sequence, now_ns, self._gid)
         self._publisher.put(data, attachment=attachment.encode())
-
-
-def _announcement(session: zenoh.Session, domain: int, number: int = 0, kind: str = "NN", what: str = "") -> str:
-    """rmw_zenoh's liveliness key of the node (`NN`) or of one of its publishers (`MP`)."""
-    key = f"@ros2_lv/{domain}/{session.info.zid()}/0/{number}/{kind}/%/%/{_NODE}"
-    return f"{key}/{what}" if what else key

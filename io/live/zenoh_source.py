@@ -2,25 +2,34 @@
 
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 
 import zenoh
 
 from ...factors.errors import LogError
 from ..decode import ChannelInfo
-from ..messages import CameraInfoBody, PickBody
-from .admission import Expected, Limits
+from ..messages import Body, CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, PickBody
+from ..schemas import MARKER_DETECTIONS, PIXEL_PICK
+from .admission import Expected, Limits, plain_topic
 from .backoff import Backoff
 from .bounded import BoundedQueue
 from .intake import Intake
 from .interfaces import Clock, Deliver
-from .zenoh_link import DEFAULT_ROUTER, any_type, channel_of, check_router, open_session, read_attachment
+from .zenoh_link import DEFAULT_ROUTER, Announcements, any_type, channel_of, check_router, open_session, read_attachment
 
 _Sample = tuple[str, str, bytes, bytes]
 """Topic, key, payload, attachment."""
 _LOOK_S = 0.5
 _SMALL = 1 << 14
+_TYPES: dict[type[Body], str] = {
+    ImageBody: "sensor_msgs/msg/Image",
+    DepthBody: "sensor_msgs/msg/Image",
+    CloudBody: "sensor_msgs/msg/PointCloud2",
+    CameraInfoBody: "sensor_msgs/msg/CameraInfo",
+    DetectionsBody: MARKER_DETECTIONS,
+    PickBody: PIXEL_PICK,
+}
 
 
 class ZenohSource:
@@ -48,12 +57,13 @@ class ZenohSource:
         check_router(router)
         self._router = router
         self._domain = domain
-        self._topics: Iterable[str] = tuple(expected)
+        self._expected = expected
         self._dear = {topic for topic, types in expected.items() if set(types) & {PickBody, CameraInfoBody}}
         self._intake = Intake(clock, expected, limits)
         self._queue: BoundedQueue[_Sample] = BoundedQueue(maximum_count, maximum_bytes)
         self._channels: dict[tuple[str, str], ChannelInfo | str] = {}
         self._session: zenoh.Session | None = None
+        self._announcements: Announcements | None = None
         self._subscribers: list[zenoh.Subscriber] = []
         self._stopping = threading.Event()
         self._status = "not started"
@@ -118,8 +128,9 @@ class ZenohSource:
                 session = open_session(self._router)
                 self._subscribers = [
                     session.declare_subscriber(any_type(self._domain, topic), partial(self._sample, topic))
-                    for topic in self._topics
+                    for topic in self._expected
                 ]
+                self._announcements = self._announce(session)
                 self._session, self._status = session, "connected"
             except (LogError, zenoh.ZError) as error:
                 self._status = str(error)
@@ -130,6 +141,15 @@ class ZenohSource:
             if self.connected() and not was_connected:
                 self._intake.tally.add("reconnects")
             was_connected = self.connected()
+
+    def _announce(self, session: zenoh.Session) -> Announcements:
+        """Ask for images uncompressed; where they come compressed all the same, they are taken so."""
+        announcements = Announcements(session, self._domain)
+        for topic, bodies in self._expected.items():
+            if plain_topic(topic) == topic:
+                for type_name in {_TYPES[body] for body in bodies if body in _TYPES}:
+                    announcements.subscription(topic, type_name)
+        return announcements
 
     def _sample(self, topic: str, sample: zenoh.Sample) -> None:
         """In zenoh's thread: never waits, for that would hold up the robot."""

@@ -1,0 +1,110 @@
+"""Corners of boards in the graph: their variables, where their page puts them, and what each image says of them."""
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ..factors import keys
+from ..factors.board import page_corners, page_factor
+from ..factors.measurements import MarkerSighting
+from ..factors.noise import gaussian, robust
+from ..factors.projection import machine_projection, mobile_projection
+from ..factors.rig import Rig
+from ..frontends.board_fit import corner_covariance
+from .board_inspection import FAMILY
+from .board_news import GEOMETRY, BoardNews
+from .board_start import inset_sigma_px
+from .graph import Record, State, Update
+from .sheet import PageFactor, Sheet
+from .view_cells import ViewCells, added_covariance
+
+Float = NDArray[np.float64]
+
+STILL_VIEWS = 40
+"""Views of a board from one place after which further ones are left out: they would count one part in so many."""
+
+
+class CornerFactors:
+    """Makes the factors of sightings that are trusted."""
+
+    def __init__(self, rig: Rig, state: State, news: BoardNews) -> None:
+        self._rig = rig
+        self._state = state
+        self._news = news
+        self._next_slot = 0
+        self._cells: dict[tuple[str, str], ViewCells] = {}
+        self.inset_sigma_px: dict[tuple[str, str], float] = {}
+        """By camera and board: how far its corners may all lie inside (or outside) of the true ones."""
+
+    def add(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> bool:
+        """Four corners in one image; False where its place has been seen from often enough."""
+        covariance = self._with_common_part(sheet, keyframe, sighting, update)
+        if covariance is None:
+            return False
+        self._note_source(sighting)
+        slot = self._slot(sheet, sighting, update)
+        source = f"corners {sighting.camera} {sheet.board.id}"
+        for i in range(4):
+            model = robust(gaussian(covariance[i]), self._rig.gates.robust_sigma)
+            point = keys.corner(slot, i)
+            if sighting.camera == "b_rgb":
+                factor = machine_projection(sighting.corners_px[i], model, keyframe, point)
+            else:
+                factor = mobile_projection(sighting.camera, sighting.corners_px[i], model, keyframe, point)
+            what = f"marker {sighting.marker} corner {i} in {sighting.camera}"
+            update.add(factor, Record(FAMILY, source, sighting.stamp_ns, what, camera=sighting.camera))
+        return True
+
+    def _note_source(self, sighting: MarkerSighting) -> None:
+        """How far the detector of these corners may be biased."""
+        key = (sighting.camera, sighting.board)
+        sigma = inset_sigma_px(sighting, self._rig.noise)
+        self.inset_sigma_px[key] = max(sigma, self.inset_sigma_px.get(key, 0.0))
+
+    def _slot(self, sheet: Sheet, sighting: MarkerSighting, update: Update) -> int:
+        """The marker's corner variables, made on its first sighting."""
+        if sighting.marker in sheet.slots:
+            return sheet.slots[sighting.marker]
+        slot = sheet.slots[sighting.marker] = self._next_slot
+        self._next_slot += 1
+        marker = sheet.marker(sighting.marker)
+        o_T_f = self._pose_of(sheet.key, update)
+        page = sheet.page
+        side, scale = update.values.atVector(page) if update.values.exists(page) else self._state.vector(page)
+        for i, corner in enumerate(page_corners(marker, side, scale)):
+            update.guess(keys.corner(slot, i), o_T_f.transformFrom(corner))
+        after = f" after knock {sheet.epoch}" if sheet.epoch else ""
+        what = f"marker {sighting.marker} lies on page {sheet.board.id}{after}"
+        factor = page_factor(sheet.board, marker, sheet.key, page, slot, self._detection_error_m(sighting, side))
+        update.add(factor, Record(GEOMETRY, f"page {sheet.board.id}", sighting.stamp_ns, what, rejectable=False))
+        sheet.pages[what] = PageFactor(sighting.marker, slot, sheet.epoch, self._detection_error_m(sighting, side))
+        return slot
+
+    def _pose_of(self, key: int, update: Update) -> gtsam.Pose3:
+        return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
+
+    def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
+        """A corner's lasting detection error on the page, from its size in this first view.
+
+        Zero where the pixels were at hand: of the fit to them nothing lasts from place to place but an inset.
+        """
+        if sighting.common_px is not None:
+            return 0.0
+        diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
+        return self._rig.noise.marker_common_px * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
+
+    def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
+        """Adds the part of a corner's error that views from the same place share; None where they are plenty.
+
+        Views are counted per cell of viewing position; the n-th one of a cell gets what it adds to those before it.
+        """
+        cells = self._cells.setdefault((sheet.board.id, sighting.camera), ViewCells())
+        if cells.last != keyframe:
+            view = self._pose_of(sheet.key, update).between(self._pose_of(keyframe, update))
+            cells.count(keyframe, view.matrix())
+        if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
+            self._news.refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
+            return None
+        given = self._rig.noise.marker_common_px
+        common = given if sighting.common_px is None else sighting.common_px
+        return added_covariance(corner_covariance(sighting, given), common, cells.views)
