@@ -281,7 +281,7 @@ class Stream:
         now = time.monotonic()
         self._deaths = [t for t in self._deaths if now - t < 60.0] + [now]
         self._count("restarts")
-        self.last_problem = why
+        self.last_problem = self.last_problem or why  # a traceback says more than an exit code
         if len(self._deaths) > RESTARTS:
             self.problem = f"the {why.strip()} died {len(self._deaths)} times within a minute; report this as a defect"
             self._stopping.set()
