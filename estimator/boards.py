@@ -58,6 +58,13 @@ class Boards:
     def rejected(self) -> list[Rejection]:
         return [*self.news.refused, *self.inspection.rejected]
 
+    def begin_slots(self, first: int) -> None:
+        """New markers get slots from here on: those before are taken."""
+        self._next_slot = first
+
+    def lists_of_rejections(self) -> list[list[Rejection]]:
+        return [self.news.refused, self.inspection.rejected]
+
     def known(self, board: str) -> bool:
         """Has the board a pose in the graph?"""
         return self.sheets[board].known

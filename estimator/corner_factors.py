@@ -16,7 +16,7 @@ from .board_news import GEOMETRY, BoardNews
 from .board_start import inset_sigma_px
 from .graph import Record, State, Update
 from .sheet import PageFactor, Sheet
-from .view_cells import LEAST_OWN_SHARE, ViewCells, added_covariance
+from .view_cells import ViewCells, added_covariance
 
 Float = NDArray[np.float64]
 
@@ -84,11 +84,8 @@ class CornerFactors:
         return update.values.atPose3(key) if update.values.exists(key) else self._state.pose(key)
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
-        """A corner's lasting detection error on the page, from its size in this first view.
-
-        Part of what views from one place share comes back from every place: it belongs to the printed pattern.
-        """
-        lasting = self._rig.noise.marker_common_px if sighting.common_px is None else lasting_px(sighting)
+        """A corner's lasting detection error on the page, from its size in this first view."""
+        lasting = max(self._rig.noise.marker_common_px, sighting.common_px or 0.0)
         diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
         return lasting * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
 
@@ -104,19 +101,5 @@ class CornerFactors:
         if cells.views > STILL_VIEWS and sighting.marker in sheet.slots:
             self._news.refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
             return None
-        if sighting.common_px is None:
-            common = self._rig.noise.marker_common_px
-            return added_covariance(corner_covariance(sighting, common), common, cells.views)
-        lasting = lasting_px(sighting)
-        # the page's factor has the lasting part
-        return added_covariance(sighting.covariance_px2 - lasting**2 * np.eye(2), lasting, cells.views)
-
-
-def lasting_px(sighting: MarkerSighting) -> float:
-    """Sigma of a corner's error that comes back from every place: half the variance that views from one place share.
-
-    The other half changes with the place. All of it is within the covariance, of which a part is left to the view.
-    """
-    least = float(np.linalg.eigvalsh(sighting.covariance_px2).min())
-    shared = min((sighting.common_px or 0.0) ** 2, (1.0 - LEAST_OWN_SHARE) * least)
-    return float(np.sqrt(shared / 2))
+        least = self._rig.noise.marker_common_px
+        return added_covariance(corner_covariance(sighting, least), max(least, sighting.common_px or 0.0), cells.views)

@@ -58,6 +58,8 @@ class DepthPipes:
         self._pipes = pipes
         self.seen: dict[tuple[str, int], SeenCylinder] = {}
         """By pipe and key of the station's `o_T_b`."""
+        self.remembered: set[tuple[str, int]] = set()
+        """Those that an earlier run has seen: what they said is in its memory."""
         self.refused: dict[tuple[str, int], Rejection] = {}
         """Why a pipe was not found in the last cloud that was searched."""
 
@@ -67,6 +69,7 @@ class DepthPipes:
             name
             for name in self._pipes.cylinders
             if self._pipes.axis(name) is not None
+            and (name, base) not in self.remembered
             and not ((name, base) in self.seen and self.seen[name, base].entered)
             and self._state.has(base)
             and self._state.has(keys.DEPTH)

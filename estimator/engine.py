@@ -4,7 +4,7 @@ One engine serves offline and streaming. `add` takes all measurements of one sta
 hold something for the graph.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import gtsam
 import numpy as np
@@ -38,7 +38,7 @@ from .incremental import Incremental
 from .marker_points import MarkerPoint, parse_point
 from .observability import why_no_base
 from .odometry import FAMILY as ODOMETRY
-from .odometry import FramePose, Odometry, OdometrySettings
+from .odometry import Odometry, OdometrySettings
 from .pipes import Pipes, SeenFrom
 from .placement import place
 from .stations import Stations, move_event
@@ -54,6 +54,10 @@ COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
+
+WAITING_BUNDLES = 200
+"""Frames without a known board that a run without end keeps."""
+WAITING_PICKS = 100
 
 
 class Engine:
@@ -96,6 +100,8 @@ class Engine:
         """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
         self._unsolved = 0
         """Keyframes since the last update."""
+        self.astray = False
+        """The map is from an earlier run, and the camera has not found itself in it."""
         self.end_ns = 0
 
     @property
@@ -161,8 +167,12 @@ class Engine:
 
     def _insert_keyframe(self, bundle: Bundle) -> None:
         if bundle.frame is not None:
+            placed = self._relocalised(bundle) if self.astray else None
+            if self.astray and placed is None:
+                return
+            self.astray = False
             index = self.odometry.last_keyframe + 1
-            update, rejected = self.odometry.insert(bundle.frame)
+            update, rejected = self.odometry.insert(bundle.frame, placed)
             self.rejected += rejected
             self._take(update)
         else:
@@ -178,6 +188,27 @@ class Engine:
         if bundle.frame is not None:
             self.flush()
             self._lay_landmarks(index)
+
+    def _relocalised(self, bundle: Bundle) -> gtsam.Pose3 | None:
+        """Where the camera stands in the map of an earlier run, by the boards that it sees."""
+        if not _mobile(bundle):
+            return None
+        return place(self.boards, self.state, bundle.sightings, (gtsam.Pose3(), 1 << 62))
+
+    def promote(self, bundle: Bundle) -> bool:
+        """Makes a frame of the recent past a keyframe, because somebody clicked in it; False where that is too late."""
+        if bundle.frame is None or bundle.stamp_ns in self.keyframe_at:
+            return bundle.stamp_ns in self.keyframe_at
+        found = self.odometry.insert_late(bundle.frame)
+        if found is None:
+            return False
+        self.rejected += found[1]
+        self._take(found[0])
+        index = self.odometry.last_keyframe
+        self.keyframe_at[bundle.stamp_ns] = index
+        self._see_boards(keys.keyframe(index), bundle)
+        self.flush()
+        return True
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
         mobile = _mobile(bundle)
@@ -212,16 +243,16 @@ class Engine:
         update.guess(key, pose)
         if index == 0:
             update.add(gauge_prior(key), Record("gauge", "gauge", bundle.stamp_ns, "origin {o}", rejectable=False))
-        self.odometry.keyframe_stamps.append(bundle.stamp_ns)
-        self.odometry.frames.append(FramePose(bundle.stamp_ns, index, np.eye(4)))
+        self.odometry.place(bundle.stamp_ns, index)
         self._take(update)
         return index
 
     def _nearest(self, stamp_ns: int) -> tuple[gtsam.Pose3, int]:
         """The keyframe nearest in time: its pose, and how far it is, ns."""
-        stamps = np.array(self.odometry.keyframe_stamps)
-        index = int(np.argmin(np.abs(stamps - stamp_ns)))
-        return self.state.pose(keys.keyframe(index)), int(abs(stamps[index] - stamp_ns))
+        if not self.keyframe_at:
+            return gtsam.Pose3(), 1 << 62
+        nearest = min(self.keyframe_at, key=lambda stamp: abs(stamp - stamp_ns))
+        return self.state.pose(keys.keyframe(self.keyframe_at[nearest])), abs(nearest - stamp_ns)
 
     def revisit(self) -> None:
         """Frames that saw no known board get another chance, as long as that makes more boards known."""
@@ -284,6 +315,8 @@ class Engine:
         for track, index in self.odometry.seen_in.items():
             by_keyframe.setdefault(index, {})[track] = self.odometry.observations[track]
         for index, observations in by_keyframe.items():
+            if not self.state.has(keys.keyframe(index)):
+                continue  # it has left the graph
             pose = self.state.pose(keys.keyframe(index))
             self._take(self.surfaces.lay(self.base, pose, observations))
         self.events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
@@ -371,6 +404,11 @@ class Engine:
             return None
         return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
 
+    def take_picks(self, bundle: Bundle) -> None:
+        """Clicks in a keyframe that is in the graph already."""
+        self._picks_of(bundle)
+        self.flush()
+
     def _picks_of(self, bundle: Bundle) -> None:
         for pick in bundle.picks:
             self._pick(pick, bundle.depths_m.get(pick.point_id))
@@ -443,6 +481,56 @@ class Engine:
             *self.surfaces.refused.values(),
             *waiting,
         ]
+
+    # A run without end ----------------------------------------------------------------------------------------
+
+    def unsolved(self) -> bool:
+        """Are there factors that have not been through the solver?"""
+        return not self._pending.empty()
+
+    @property
+    def mounted(self) -> bool:
+        """Is the taped mount in the graph?"""
+        return self._mounted
+
+    @property
+    def distances_open(self) -> list[Distance]:
+        """Known distances that have not entered, because a point of them has not been seen."""
+        return list(self._distances_open)
+
+    def resume(self, memory: Update, keyframes: int, mounted: bool, distances_open: list[Distance]) -> None:
+        """Goes on from what an earlier run knew, in the same {o}; the camera has to find itself again.
+
+        Args:
+            memory: the variables that live on, and one factor with all that is known about them.
+            keyframes: how many the earlier run made; new ones count on from there.
+        """
+        self.state.values = self.solver.update(memory)
+        self.odometry.keyframe_stamps = [0] * max(keyframes, 1)
+        self._mounted = mounted
+        self._distances_open = distances_open
+        self.astray = True
+
+    def held_keyframes(self) -> set[int]:
+        """Keys of keyframes on which measurements hang that have not entered the graph."""
+        held = {key for sheet in self.boards.sheets.values() for key, _ in sheet.held}
+        held |= {view.keyframe for sheet in self.boards.sheets.values() for view in sheet.displaced}
+        return held | self.pipes.held_keyframes()
+
+    def forget(self, gone: Collection[int]) -> None:
+        """Variables that have left the graph: nothing may hang on them any more."""
+        left = {keys.index(k) for k in gone if keys.kind(k) == "x"}
+        landmarks = {keys.index(k) for k in gone if keys.kind(k) == "l"}
+        self.keyframe_at = {stamp: i for stamp, i in self.keyframe_at.items() if i not in left}
+        self.odometry.forget(left, landmarks)
+        self.surfaces.forget(landmarks)
+        self.pipes.forget({k for k in gone if keys.kind(k) == "x"})
+        self._waiting = self._waiting[-WAITING_BUNDLES:]
+        self.open_picks = self.open_picks[-WAITING_PICKS:]
+
+    def lists_of_rejections(self) -> list[list[Rejection]]:
+        """Where refusals gather; whoever runs for hours shortens them."""
+        return [self.rejected, *self.boards.lists_of_rejections(), self.pipes.rejected]
 
     def everything_told(self) -> list[Event]:
         return [*self.events, *self.boards.events]

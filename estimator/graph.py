@@ -78,6 +78,9 @@ class FactorLog:
         self.factors: list[gtsam.NonlinearFactor] = []
         self.records: list[Record] = []
         self.off: set[int] = set()
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._in_graph, self._off_graph = 0, 0
+        """How many factors the graph has taken, and how many were off then."""
 
     def append(self, update: Update) -> None:
         self.factors.extend(update.factors)
@@ -89,7 +92,12 @@ class FactorLog:
                 yield index, factor, record
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        graph = gtsam.NonlinearFactorGraph()
-        for _, factor, _ in self.active():
-            graph.add(factor)
-        return graph
+        """The active factors in their order; to be read only, and until the next change."""
+        if len(self.off) != self._off_graph:
+            self._graph = gtsam.NonlinearFactorGraph()
+            self._in_graph, self._off_graph = 0, len(self.off)
+        for index in range(self._in_graph, len(self.factors)):
+            if index not in self.off:
+                self._graph.add(self.factors[index])
+        self._in_graph = len(self.factors)
+        return self._graph

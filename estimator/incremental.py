@@ -1,13 +1,15 @@
 """The running solver: iSAM2 over the factors as they come."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from .graph import FactorLog, Update
+from .graph import FactorLog, Record, Update
+from .marginal import FAMILY, gaussian_of, marginal
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -35,9 +37,32 @@ RELINEARIZE_EVERY = 10
 """Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
 of a batch solution; `settle` makes up for what is left at the end."""
 
+SETTLE_ROUNDS = 2
+"""Relinearisations before variables leave: what they say is frozen where it is taken."""
+
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """What leaves the graph, and how."""
+
+    leaving: set[int]
+    """Keys; what their factors say about the others stays, as one Gaussian factor."""
+    dropped: set[int]
+    """Keys that go with all of their factors, as if they had never been measured."""
+    split: set[int]
+    """Landmarks that stay, of which the factors of what leaves are taken for those of another point."""
+
+    def giving_up(self, key: int) -> "Cut | None":
+        """The same without a landmark that nothing determines; None where the key is no landmark's."""
+        if keys.kind(key) == keys.kind(keys.landmark_before(0)):
+            key = keys.landmark(keys.index(key))
+        if keys.kind(key) != "l":
+            return None
+        return Cut(self.leaving - {key}, self.dropped | {key}, self.split - {key})
 
 
 class Incremental:
@@ -118,6 +143,62 @@ class Incremental:
             self._isam.update(graph, values)
         self._values = self._isam.calculateEstimate()
 
+    def values(self) -> gtsam.Values:
+        """The estimate over the factors of the log."""
+        return self._values
+
+    def switch_off(self, remove: Iterable[int]) -> gtsam.Values:
+        """Takes factors out again, by their places in the log."""
+        return self.update(Update(), remove)
+
+    def reduce(self, cut: Cut, stamp_ns: int) -> gtsam.Values:
+        """Takes variables out of the graph and starts iSAM2 anew on the rest.
+
+        Raises:
+            ObservabilityError: a variable that leaves is not determined.
+        """
+        self.settle(SETTLE_ROUNDS)
+        values = gtsam.Values(self._values)
+        past = {key: keys.landmark_before(keys.index(key)) for key in cut.split}
+        for key, before in past.items():
+            values.insert(before, values.atPoint3(key))
+        gone = {*cut.leaving, *past.values()}
+        absorbed: list[gtsam.NonlinearFactor] = []
+        log = FactorLog()
+        for _, factor, record in self.log.active():
+            involved = set(factor.keys())
+            if involved & cut.dropped:
+                continue
+            if involved & cut.leaving or record.family == FAMILY:
+                torn = [past.get(key, key) for key in factor.keys()]
+                absorbed.append(factor.rekey(torn) if involved & cut.split else factor)
+            else:
+                log.factors.append(factor)
+                log.records.append(record)
+        with determined():
+            prior = marginal(absorbed, values, gone)
+        what = f"what earlier keyframes said about {len(prior.keys)} variables"
+        log.factors.append(prior.factor())
+        log.records.append(Record(FAMILY, FAMILY, stamp_ns, what, rejectable=False))
+        for key in gone | cut.dropped:
+            values.erase(key)
+        self.log = log
+        self._begin(values)
+        return gtsam.Values(self._values)
+
+    def _begin(self, values: gtsam.Values) -> None:
+        """iSAM2 anew on all factors, linearised at `values`."""
+        self._isam = gtsam.ISAM2(_parameters())
+        self._values = values
+        try:
+            with determined():
+                self._isam.update(self.log.graph(), values)
+        except Undetermined:
+            self._restart()
+            return
+        self._slots = list(range(len(self.log.factors)))
+        self._values = self._isam.calculateEstimate()
+
     def settle(self, rounds: int) -> gtsam.Values:
         """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
         empty, none = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -135,8 +216,12 @@ class Incremental:
 
     def joint_covariance(self, keys: Sequence[int]) -> Float:
         """Joint covariance of some variables, in the order of `keys`."""
-        joint = self._isam.jointMarginalCovariance(list(keys))
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        joint = gaussian_of(self.log.graph(), self._values, keys)
+        covariance = np.linalg.inv(joint.H)
+        ends = np.cumsum(joint.widths)
+        columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
+        chosen = np.concatenate([columns[key] for key in keys])
+        return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:

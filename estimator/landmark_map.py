@@ -28,8 +28,10 @@ def landmark_map(engine: Engine, fewest_views: int = FEWEST_VIEWS) -> LandmarkMa
     """Landmarks of {o} that were seen often enough to be points, with rough sigmas and where they were seen from."""
     state, odometry = engine.state, engine.odometry
     tracks = [
-        t for t, n in odometry.observations.items() if n >= fewest_views and state.has(keys.landmark(t))
-    ]  # fmt: skip
+        t
+        for t, n in odometry.observations.items()
+        if n >= fewest_views and state.has(keys.landmark(t)) and state.has(keys.keyframe(odometry.seen_in[t]))
+    ]
     if not tracks:
         none = np.zeros((0, 3))
         return LandmarkMap((), MapPoints(none, np.zeros(0), none))

@@ -69,6 +69,8 @@ class Odometry:
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
+        self._reference = -1
+        """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
         self.joint_covariance: Callable[[Sequence[int]], Float] | None = None
         """Of the running solver; None refuses every landmark that comes back from far away."""
 
@@ -82,13 +84,17 @@ class Odometry:
         if self.keyframe_stamps:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
-            self.frames.append(FramePose(frame.stamp_ns, self.last_keyframe, self._keyframe_T_last))
+            self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last))
 
-    def insert(self, frame: StereoFrame) -> tuple[Update, list[Rejection]]:
-        """Makes the frame just followed a keyframe."""
+    def insert(self, frame: StereoFrame, placed: gtsam.Pose3 | None = None) -> tuple[Update, list[Rejection]]:
+        """Makes the frame just followed a keyframe.
+
+        Args:
+            placed: where it stands, if that is known by other means than its motion since the last keyframe.
+        """
         update = Update()
         index = len(self.keyframe_stamps)
-        pose = self._guess_pose(frame, index)
+        pose = self._guess_pose(index) if placed is None else placed
         key = keys.keyframe(index)
         update.guess(key, pose)
         rejected: list[Rejection] = []
@@ -97,7 +103,8 @@ class Odometry:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
             known, rejected = self._gated(frame, known, pose)
-            if self._since_keyframe_lost or len(known) < self._settings.minimum_shared:
+            connected = self._state.has(keys.keyframe(self._reference))
+            if connected and (self._since_keyframe_lost or len(known) < self._settings.minimum_shared):
                 self._bridge(update, index, frame, pose)
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
@@ -105,16 +112,52 @@ class Odometry:
         if len(known) < self._settings.minimum_shared:
             self._create_from_before(update, frame, index, pose)
         self.keyframe_stamps.append(frame.stamp_ns)
+        self._reference = index
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
         self.frames = [f for f in self.frames if f.stamp_ns != frame.stamp_ns]
         self.frames.append(FramePose(frame.stamp_ns, index, np.eye(4)))
         return update, rejected
 
-    def _guess_pose(self, frame: StereoFrame, index: int) -> gtsam.Pose3:
+    def forget(self, keyframes: set[int], landmarks: set[int]) -> None:
+        """These have left the graph."""
+        self._waiting = {t: w for t, w in self._waiting.items() if w[0] not in keyframes}
+        self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
+        self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
+        self.frames = [f for f in self.frames if f.keyframe not in keyframes]
+
+    def place(self, stamp_ns: int, index: int) -> None:
+        """A keyframe that markers alone have placed."""
+        self.keyframe_stamps.append(stamp_ns)
+        self.frames.append(FramePose(stamp_ns, index, np.eye(4)))
+        self._reference = index
+
+    def insert_late(self, frame: StereoFrame) -> tuple[Update, list[Rejection]] | None:
+        """Makes a frame of the past a keyframe; None where its place is not known any more.
+
+        Its tracks tie it to the map like any other keyframe's, but it makes no new landmarks: those that it saw first
+        are in the map already, or have been found too poor.
+        """
+        past = next((f for f in reversed(self.frames) if f.stamp_ns == frame.stamp_ns), None)
+        if past is None or not self._state.has(keys.keyframe(past.keyframe)):
+            return None
+        index = len(self.keyframe_stamps)
+        pose = self._state.pose(keys.keyframe(past.keyframe)).compose(pose3(past.keyframe_T_this))
+        update = Update()
+        update.guess(keys.keyframe(index), pose)
+        known, _ = self._split(frame)
+        known, rejected = self._gated(frame, known, pose)
+        if len(known) < self._settings.minimum_shared:
+            return None
+        for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
+            self._observe(update, frame, row, index)
+        self.keyframe_stamps.append(frame.stamp_ns)
+        return update, rejected
+
+    def _guess_pose(self, index: int) -> gtsam.Pose3:
         if index == 0:
             return gtsam.Pose3()
-        previous = self._state.pose(keys.keyframe(index - 1))
+        previous = self._state.pose(keys.keyframe(self._reference))
         return previous.compose(pose3(self._keyframe_T_last))
 
     def _split(self, frame: StereoFrame) -> tuple[list[int], list[int]]:
@@ -133,7 +176,7 @@ class Odometry:
         Landmarks that come back into view after a time show the drift since, which the living ones do not: they have
         their own shift, and it has to be one that the drift can be.
         """
-        newest = self.last_keyframe
+        newest = self._reference
         ids = frame.track_ids
         back = [r for r in rows if newest - self.seen_in.get(int(ids[r]), newest) >= AWAY]
         living = sorted(set(rows) - set(back))
@@ -193,9 +236,9 @@ class Odometry:
 
         The median over a few of them: they share the drift. What the living tracks show too is the pose's guess.
         """
-        if self.joint_covariance is None:
+        last = keys.keyframe(self._reference)
+        if self.joint_covariance is None or not self._state.has(last):
             return float("inf")
-        last = keys.keyframe(self.last_keyframe)
         to_last = self._state.pose(last).between(pose).inverse().AdjointMap()
         K = self._state.intrinsics(keys.intrinsics("m_left")).K()
         chosen = rows[:: max(len(rows) // DRIFT_SAMPLE, 1)]
@@ -213,8 +256,8 @@ class Odometry:
 
     def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
-        earlier = keys.keyframe(index - 1)
-        seconds = (frame.stamp_ns - self.keyframe_stamps[-1]) * 1e-9
+        earlier = keys.keyframe(self._reference)
+        seconds = (frame.stamp_ns - self.keyframe_stamps[self._reference]) * 1e-9
         motion = self._state.pose(earlier).between(pose)
         factor = motion_prior(
             earlier,

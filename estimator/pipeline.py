@@ -44,6 +44,22 @@ class Pipeline:
             self._depths.see(sensed.depth)
             self._base.search(sensed.depth)
 
+    def look_back(self, sensed: Sensed) -> bool:
+        """Clicks in a frame that was taken in before: it becomes a keyframe. False where that is too late."""
+        if not self.engine.promote(sensed.bundle) or sensed.pair is None:
+            return False
+        self.engine.pick_images.update(sensed.clicked)
+        self.engine.take_picks(sensed.bundle)
+        self._outlines.see(sensed.pair, sensed.bundle.picks)
+        return True
+
+    def complete(self) -> None:
+        """What waited for something else gets its last chance."""
+        self.engine.revisit()
+        if self._base.search(self._depths.view, last=True):
+            self.engine.revisit()
+        self._depths.search()
+
     def check(self, report: SensingReport) -> None:
         """After the last message: is there anything to estimate from, and was everything understood?
 
@@ -51,10 +67,7 @@ class Pipeline:
             LogError: a pick without depth or second view, or on a camera that never delivered.
             ObservabilityError: a pick in a camera that nothing places.
         """
-        self.engine.revisit()
-        if self._base.search(self._depths.view, last=True):
-            self.engine.revisit()
-        self._depths.search()
+        self.complete()
         self._check_ids(report)
         pairing = report.pairing
         if pairing.pairs == 0 and pairing.unpaired and not self.engine.odometry.keyframe_stamps:

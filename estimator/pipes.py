@@ -58,6 +58,24 @@ class _Cylinder:
     outlines: int = 0
 
 
+def known_point(
+    index: int,
+    name: str,
+    role: str,
+    pipe: str | None,
+    on_axis: bool,
+    picks: int,
+    stamp_ns: int,
+) -> _Point:
+    """A point that an earlier run knew."""
+    return _Point(index, name, role, pipe, known=True, on_axis=on_axis, picks=picks, stamp_ns=stamp_ns)
+
+
+def known_cylinder(index: int, pipe: Pipe, outlines: int) -> _Cylinder:
+    """A pipe that an earlier run knew."""
+    return _Cylinder(index, pipe, known=True, outlines=outlines)
+
+
 class Pipes:
     """All pipe points and pipes of one run."""
 
@@ -71,6 +89,16 @@ class Pipes:
         """Picks that are in the graph, in the order of their entry."""
         self.outlined: list[tuple[SeenFrom, OutlineSighting]] = []
         """Outlines that are in the graph."""
+
+    def held_keyframes(self) -> set[int]:
+        """Keys of the poses on which picks and outlines wait."""
+        points = {where.key for point in self.points.values() for where, _ in point.held}
+        return points | {where.key for cylinder in self.cylinders.values() for where, _ in cylinder.held}
+
+    def forget(self, poses: set[int]) -> None:
+        """These have left the graph; what was seen from them stays there."""
+        self.clicked = [(where, pick) for where, pick in self.clicked if where.key not in poses]
+        self.outlined = [(where, seen) for where, seen in self.outlined if where.key not in poses]
 
     def pipe_of(self, point_id: str) -> str:
         """The pipe that a point is on."""

@@ -1,6 +1,8 @@
 """Points, axes and radii in {b}, with covariance from the joint of `o_T_b` and what is seen from it."""
 
+from collections.abc import Sequence
 from functools import cache
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -10,11 +12,18 @@ from scipy.optimize import brentq
 from ..factors import keys
 from ..factors.chance import chi2_ppf
 from ..factors.geometry import point_to_frame
-from .linear import LinearSystem
 from .result import PipeEstimate
 
 Float = NDArray[np.float64]
 Blocks = list[tuple[int, Float]]
+
+
+class Covariances(Protocol):
+    """A solved problem."""
+
+    def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+        """Covariance of `J x`, J given by blocks (key, columns of the key)."""
+        ...
 
 
 def present_base(values: gtsam.Values) -> int:
@@ -68,7 +77,7 @@ def _inside(radius: float, sigma: Float) -> float:
 
 
 def pipe_estimate(
-    name: str, frame: str, index: int, base: int, near: Float, values: gtsam.Values, system: LinearSystem
+    name: str, frame: str, index: int, base: int, near: Float, values: gtsam.Values, system: Covariances
 ) -> PipeEstimate:
     """A pipe in {b}: the point of its axis nearest to `near` ({b}), direction and radius, covariance (7, 7)."""
     a, blocks_a = point_blocks(values, base, keys.axis_start(index))

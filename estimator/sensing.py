@@ -1,14 +1,15 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeGuard
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
-from ..factors.measurements import MarkerSighting, Pick, Rejection
+from ..factors.measurements import MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
@@ -20,6 +21,7 @@ from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
 
 Item = Message | StereoPair
+Tracked = Callable[[StereoFrame], object]
 
 COMPRESSED = "/compressed"
 COLOUR_PERIOD_NS = 1_000_000_000
@@ -91,17 +93,23 @@ class Sensing:
 
     def groups(self, messages: Iterable[Message]) -> Iterator[list[Item]]:
         """Messages by stamp: sorted, stereo images paired, those of one stamp together."""
-        ordered = sorted_by_stamp((_plain(m) for m in messages), report=self._order)
+        ordered = sorted_by_stamp((plain(m) for m in messages), report=self._order)
         left, right = self.rig.cameras.m_left.image_topic, self.rig.cameras.m_right.image_topic
         return _same_stamp(stereo_pairs(ordered, left, right, report=self._pairing))
 
-    def process(self, group: list[Item]) -> Sensed:
-        """All messages of one stamp."""
+    def process(self, group: list[Item], tracked: Tracked | None = None) -> Sensed:
+        """All messages of one stamp.
+
+        Args:
+            tracked: told of the frame's motion at once, before anything else is looked for.
+        """
         stamp_ns = _stamp(group[0])
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
         picks = tuple(self._pick(i) for i in group if isinstance(i, Message) and isinstance(i.body, PickBody))
         frame = self.sensors.track(pair) if pair is not None else None
+        if frame is not None and tracked is not None:
+            tracked(frame)
         kept = pair if frame is not None and (frame.is_keyframe or picks or not self._started) else None
         self._started |= frame is not None
         sightings = self._sightings(stamp_ns, group, kept)
@@ -117,6 +125,25 @@ class Sensing:
             self._clicked(picks, pair, group),
             fresh,
         )
+
+    def look_back(self, clicks: Sequence[Message], pair: PairImages, frame: StereoFrame) -> Sensed:
+        """Clicks in a frame that has been processed before: what it needs to be a keyframe after all.
+
+        Raises:
+            LogError: a click cannot be used.
+        """
+        picks = tuple(self._pick(click) for click in clicks)
+        sightings = [] if frame.is_keyframe else self._sightings(frame.stamp_ns, [], pair)
+        bundle = Bundle(frame.stamp_ns, frame, tuple(sightings), picks, self._depths(picks, pair))
+        return Sensed(bundle, pair=pair, clicked=self._clicked(picks, pair, []))
+
+    def _depths(self, picks: Sequence[Pick], pair: PairImages) -> dict[str, tuple[float, float]]:
+        """Surface depth under clicks, where it can be measured."""
+        return {p.point_id: d for p in picks if (d := self.sensors.depth_under(p, pair)) is not None}
+
+    def is_calibration(self, item: Item) -> TypeGuard[Message]:
+        """Is it a calibration of one of the cameras?"""
+        return isinstance(item, Message) and isinstance(item.body, CameraInfoBody) and item.topic in self._info
 
     def report(self) -> SensingReport:
         """What was odd, and what was refused, so far."""
@@ -207,7 +234,7 @@ def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def _plain(message: Message) -> Message:
+def plain(message: Message) -> Message:
     """A compressed topic counts as its raw one."""
     if not message.topic.endswith(COMPRESSED):
         return message

@@ -105,6 +105,12 @@ class Surfaces:
             self.refused[rows[row]] = Rejection(self.cloud.stamp_ns, FAMILY, what, reason, value, limit)
         return update
 
+    def forget(self, landmarks: set[int]) -> None:
+        """These have left the graph; what they said about the surfaces stays there."""
+        self._laid -= landmarks
+        self._tried = {t: n for t, n in self._tried.items() if t not in landmarks}
+        self.refused = {t: r for t, r in self.refused.items() if t not in landmarks}
+
     def _candidates(self, observations: dict[int, int]) -> list[int]:
         rows = []
         for track, count in observations.items():

@@ -33,6 +33,11 @@ def landmark(track: int) -> int:
     return gtsam.symbol("l", track)
 
 
+def landmark_before(track: int) -> int:
+    """A landmark as earlier keyframes saw it, where it is torn from what later ones see: Point3."""
+    return gtsam.symbol("z", track)
+
+
 def corner(slot: int, index: int) -> int:
     """Corner `index` (0..3) of the marker in `slot` (one per marker and board epoch), in {o}: Point3."""
     return gtsam.symbol("q", 4 * slot + index)
@@ -95,6 +100,11 @@ DEPTH_RAYS: int = gtsam.symbol("g", 0)
 def kind(key: int) -> str:
     """The letter of a key."""
     return chr(gtsam.Symbol(key).chr())
+
+
+def index(key: int) -> int:
+    """The number of a key."""
+    return int(gtsam.Symbol(key).index())
 
 
 def words(key: int) -> str:

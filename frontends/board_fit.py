@@ -87,10 +87,12 @@ def corner_covariance(sighting: MarkerSighting, common_px: float) -> Float:
     """Covariance of the four corners in one image, (4, 2, 2).
 
     Args:
-        common_px: what views from the same place have in common, where the sighting does not say it itself.
+        common_px: least sigma of what views from the same place have in common; what the sighting itself says of it
+            counts where it is more.
     """
     own = np.asarray(sighting.covariance_px2, float)
-    return own if sighting.common_px is not None else own + common_px**2 * np.eye(2)
+    said = sighting.common_px or 0.0
+    return own + max(common_px**2 - said**2, 0.0) * np.eye(2)
 
 
 def fit_board(

@@ -25,6 +25,7 @@ MAY_READ_A_CLOCK = (
     "io/live",
     "estimator/commands/",
     "estimator/stopwatch.py",
+    "estimator/stream/",
     "simulation/commands/",
     "simulation/campaign_run.py",
 )

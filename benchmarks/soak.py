@@ -1,0 +1,123 @@
+"""Does the stream stay as cheap as it began? A recording played again and again, as fast as it goes.
+
+    python benchmarks/soak.py run.mcap --minutes 60 --wall 600
+
+prints processor time per frame by tenths of the input and resident memory by process, and says whether the last tenth
+costs at most 1.1 times the first and memory grows by less than 5 % after the first five minutes of input.
+"""
+
+import argparse
+import json
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from surecut.estimator.optimise import rig_of
+from surecut.estimator.sensing import wanted_topics
+from surecut.estimator.stream.settings import StreamSettings
+from surecut.estimator.stream.stream import Stream
+from surecut.io.live.replay import Replay
+from surecut.io.reader import LogReader
+
+COST, MEMORY = 1.1, 1.05
+WARM_UP_S = 300.0
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One look at the three processes."""
+
+    stamp_s: float
+    """Of the input, since its start."""
+    frames: int
+    cpu_s: tuple[float, ...]
+    """Of ordering and publishing, front ends, graph."""
+    rss_mb: tuple[float, ...]
+
+
+def looked(stream: Stream, first_ns: int) -> Sample:
+    pids = [os.getpid(), *stream.pids()]
+    return Sample(
+        (stream.stamp_ns() - first_ns) * 1e-9,
+        stream.counts.get("frames", 0),
+        tuple(cpu_s(pid) for pid in pids),
+        tuple(rss_mb(pid) for pid in pids),
+    )
+
+
+def cpu_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def rss_mb(pid: int) -> float:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
+    with LogReader(log) as reader:
+        rig = rig_of(reader, None)
+    stream = Stream(rig, [Replay(log, None, wanted_topics(rig), repeat=10**6)], [], StreamSettings(), live=False)
+    samples: list[Sample] = []
+    began = time.monotonic()
+    first: list[int] = []
+    last = [0.0]
+
+    def progress(_: Stream) -> None:
+        if not stream.stamp_ns():
+            return
+        if not first:
+            first.append(stream.stamp_ns())
+        seconds = (stream.stamp_ns() - first[0]) * 1e-9
+        if seconds - last[0] >= 2.0 or not samples:
+            last[0] = seconds
+            samples.append(looked(stream, first[0]))
+        if seconds >= 60 * minutes or time.monotonic() - began > wall_s:
+            stream.stop()
+
+    stream.run(progress)
+    print(json.dumps({k: v for k, v in stream.counters().items() if not k.startswith("source")}))
+    if stream.last_problem:
+        print(stream.last_problem)
+    return samples
+
+
+def table(samples: list[Sample]) -> bool:
+    """Prints cost by tenths and memory; whether both stay within their limits."""
+    end = samples[-1].stamp_s
+    print(f"{end / 60:.1f} minutes of input, {samples[-1].frames} frames")
+    print("input min   cpu ms per frame: ordering  front ends  graph   resident MB")
+    costs = []
+    for tenth in range(10):
+        part = [s for s in samples if tenth * end / 10 <= s.stamp_s <= (tenth + 1) * end / 10]
+        if len(part) < 2:
+            continue  # less than a look at a time
+        frames = max(part[-1].frames - part[0].frames, 1)
+        cost = [1e3 * (b - a) / frames for a, b in zip(part[0].cpu_s, part[-1].cpu_s, strict=True)]
+        costs.append(sum(cost))
+        memory = " ".join(f"{m:.0f}" for m in part[-1].rss_mb)
+        parts = f"{cost[0]:9.1f} {cost[1]:11.1f} {cost[2]:6.1f}"
+        print(f"{part[-1].stamp_s / 60:9.1f} {sum(cost):18.1f} {parts}   {memory}")
+    if not costs:
+        print("too short to tell")
+        return False
+    warm = next((s for s in samples if s.stamp_s >= WARM_UP_S), samples[-1])
+    grown = sum(samples[-1].rss_mb) / sum(warm.rss_mb)
+    print(f"cost of the last tenth over the first: {costs[-1] / costs[0]:.2f} (limit {COST})")
+    print(f"memory at the end over that after five minutes: {grown:.3f} (limit {MEMORY})")
+    return costs[-1] <= COST * costs[0] and grown <= MEMORY
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("log", type=Path)
+    parser.add_argument("--minutes", type=float, default=60.0, help="of input")
+    parser.add_argument("--wall", type=float, default=float("inf"), help="seconds to run at most")
+    given = parser.parse_args()
+    raise SystemExit(0 if table(soak(given.log, given.minutes, given.wall)) else 1)
+
+
+if __name__ == "__main__":
+    main()

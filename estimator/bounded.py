@@ -1,0 +1,157 @@
+"""A run without end: keyframes beyond a limit leave the graph, and what they said about the rest stays as one prior.
+
+{b}, {f}, boards, points, pipes, calibration and the landmarks that may be seen again live on. So the cost of an update
+does not grow with the time that the run has taken.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import gtsam
+
+from ..factors import keys
+from ..factors.measurements import Rejection
+from .batch import MINIMUM_VIEWS, outliers
+from .engine import Engine
+from .incremental import Cut
+from .linearised import linearise
+from .marginal import FAMILY
+from .observability import Undetermined
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """How much of the past stays as it was measured."""
+
+    keyframes: int = 80
+    """Keyframes in the graph, at most; a recording of half a minute makes about 60."""
+    step: int = 20
+    """Keyframes that leave together."""
+    map_landmarks: int = 60
+    """Landmarks of keyframes that left which stay, so that places that are seen again hold the camera."""
+    shared_landmarks: int = 40
+    """Landmarks seen on both sides of the cut that go on holding the camera to its past. Each one more makes the prior
+    larger, and it is dense. The others are taken for two points, one on each side: that only leaves something out."""
+    told: int = 1000
+    """Refused measurements and events that are kept with their words; all are counted."""
+    frames: int = 2000
+    """Frames of the trajectory that are kept."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.step < self.keyframes:
+            raise ValueError(f"step {self.step} is not between 0 and keyframes {self.keyframes}")
+
+
+@dataclass(slots=True)
+class Bounded:
+    """Keeps one engine within limits."""
+
+    engine: Engine
+    limits: Limits = field(default_factory=Limits)
+    first: int = 0
+    """Index of the oldest keyframe in the graph."""
+    refused: Counter[str] = field(default_factory=Counter)
+    """All refused measurements whose words were dropped, by family."""
+    rebuilt: int = 0
+
+    def tidy(self) -> bool:
+        """After each bundle; True when keyframes have left the graph."""
+        engine = self.engine
+        count = engine.odometry.last_keyframe + 1 - self.first
+        if count <= self.limits.keyframes:
+            return False
+        engine.flush()
+        self._forget(engine.odometry.last_keyframe + 1 - self.limits.keyframes + self.limits.step)
+        return True
+
+    def _forget(self, first: int) -> None:
+        """All keyframes before `first` leave, but those on which something hangs that has not entered yet."""
+        engine = self.engine
+        held = engine.held_keyframes()
+        state = engine.state
+        poses = {k for i in range(self.first, first) if (k := keys.keyframe(i)) not in held and state.has(k)}
+        if not poses:
+            return
+        self._without_outliers(poses)
+        landmarks = self._landmarks_of(poses)
+        cut = self._reduced(Cut(poses | landmarks.gone, landmarks.lonely, landmarks.split))
+        self.refused_landmarks(cut.dropped)
+        self.first = first
+        self.rebuilt += 1
+        engine.forget(cut.leaving | cut.dropped)
+        self._shorten()
+
+    def _reduced(self, cut: Cut) -> Cut:
+        """Takes out what leaves; a landmark that turns out to be determined by nothing is given up with its views.
+
+        Raises:
+            ObservabilityError: something else than a landmark is not determined.
+        """
+        while True:
+            try:
+                self.engine.state.values = self.engine.solver.reduce(cut, self.engine.end_ns)
+                return cut
+            except Undetermined as error:
+                smaller = cut.giving_up(error.key)
+                if smaller is None or smaller.dropped == cut.dropped:
+                    raise
+                cut = smaller
+
+    def _without_outliers(self, poses: set[int]) -> None:
+        """What noise does not explain is not put into the prior, which nobody can take apart again."""
+        engine = self.engine
+        log = engine.solver.log
+        found = outliers(linearise(log, (), engine.solver.values(), engine.rig.gates.robust_sigma))
+        mine = [(i, told) for i, told in found if poses.intersection(log.factors[i].keys())]
+        log.off.update(i for i, _ in mine)
+        engine.rejected += [told for _, told in mine]
+
+    def _landmarks_of(self, poses: set[int]) -> "_Landmarks":
+        """Landmarks that only these keyframes saw: those that go, and those without views enough to be points."""
+        inside: Counter[int] = Counter()
+        outside: Counter[int] = Counter()
+        every: set[int] = set()
+        bound: set[int] = set()
+        """On a surface of the Kinect's: those factors know their variables by name."""
+        for _, factor, record in self.engine.solver.log.active():
+            involved = factor.keys()
+            marks = [k for k in involved if keys.kind(k) == "l"]
+            every.update(marks)
+            if record.family == FAMILY:
+                inside.update(dict.fromkeys(marks, MINIMUM_VIEWS))
+            elif record.camera is not None and marks:
+                (inside if poses.intersection(involved) else outside).update(marks)
+            if isinstance(factor, gtsam.CustomFactor):
+                bound.update(marks)
+        seen = {k for k in every if not outside[k]}
+        lonely = {k for k in seen if inside[k] < MINIMUM_VIEWS}
+        views = self.engine.odometry.observations
+        known = sorted(seen - lonely, key=lambda k: -views.get(keys.index(k), 0))
+        both = [k for k in every - seen if inside[k] >= MINIMUM_VIEWS and k not in bound]
+        both.sort(key=lambda k: -(inside[k] * outside[k]))
+        split = {k for k in both[self.limits.shared_landmarks :] if outside[k] >= MINIMUM_VIEWS}
+        return _Landmarks(set(known[self.limits.map_landmarks :]), lonely, split)
+
+    def refused_landmarks(self, lonely: set[int]) -> None:
+        """Tells of the views that go with landmarks that are no points."""
+        if lonely:
+            stamp = self.engine.end_ns
+            text = f"views of {len(lonely)} landmarks"
+            reason = "too few good views of the landmark; views"
+            self.engine.rejected.append(Rejection(stamp, "stereo odometry", text, reason, 1.0, MINIMUM_VIEWS))
+
+    def _shorten(self) -> None:
+        """Lists that only tell keep their newest entries."""
+        engine, most = self.engine, self.limits.told
+        for told in engine.lists_of_rejections():
+            self.refused.update(r.family for r in told[:-most])
+            del told[:-most]
+        del engine.events[:-most]
+        del engine.odometry.frames[: -self.limits.frames]
+
+
+@dataclass(frozen=True, slots=True)
+class _Landmarks:
+    gone: set[int]
+    lonely: set[int]
+    split: set[int]

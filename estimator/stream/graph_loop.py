@@ -1,0 +1,294 @@
+"""The graph's half of the stream: what the front ends saw in, answers out, within bounds of memory and time."""
+
+import hashlib
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...factors import keys
+from ...factors.errors import ObservabilityError, SurecutError
+from ...factors.rig import Rig, dump_rig
+from ..bounded import Bounded
+from ..decision import Decision, decide
+from ..pipeline import Pipeline
+from ..points_in_base import pipe_estimate, point_blocks, radius95
+from ..result import PipeEstimate, PointEstimate, PoseEstimate, Result
+from ..sensing import Sensed
+from ..validated_range import ValidatedRange
+from .audit import Audit, audit
+from .calibration import departures, held, hold
+from .memory import Memory, recall, remember, save
+from .posterior import Posterior, posterior_of
+from .settings import S, StreamSettings
+from .trust import grown
+from .wire import Answer, Place
+
+Float = NDArray[np.float64]
+
+PICTURES = 50
+"""Cut-outs of clicks that are kept."""
+EVENTS = 50
+
+
+class GraphLoop:
+    """One engine for hours.
+
+    Args:
+        tell: takes each answer.
+        memory: what an earlier run knew.
+        checkpoint: file that is kept up to date; None for none.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        settings: StreamSettings,
+        tell: Callable[[Answer], object],
+        memory: Memory | None = None,
+        checkpoint: Path | None = None,
+        validated: ValidatedRange | None = None,
+    ) -> None:
+        self.rig = rig
+        self._settings = settings
+        self._tell = tell
+        self._checkpoint = checkpoint
+        self._validated = validated
+        self._rig_sha256 = hashlib.sha256(dump_rig(rig).encode()).hexdigest()
+        self.pipeline = Pipeline(rig)
+        self.engine = self.pipeline.engine
+        self._bounded = Bounded(self.engine, settings.limits)
+        if memory is not None:
+            recall(self.engine, memory)
+            self._bounded.first = memory.keyframes
+        self._audit = Audit()
+        self._next_audit_ns = self._next_answer_ns = 0
+        self._saved_s = time.monotonic()
+        self._answer: Answer | None = None
+        self._changed = memory is not None
+        self._first_ns: int | None = None
+        self.counts: Counter[str] = Counter()
+
+    # In -------------------------------------------------------------------------------------------------------
+
+    def take(self, sensed: Sensed, busy: bool = False) -> None:
+        """Everything of one stamp.
+
+        Args:
+            busy: more is waiting: answers may be rarer.
+        """
+        if self._first_ns is None:
+            self._first_ns = sensed.stamp_ns
+        before = self.engine.odometry.last_keyframe
+        try:
+            self.pipeline.take(sensed)
+        except ObservabilityError as error:
+            self.counts["undetermined"] += 1
+            self.counts["failures"] += 1
+            raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
+        new = self.engine.odometry.last_keyframe > before
+        clicked = bool(sensed.bundle.picks)
+        self._changed |= new or clicked or sensed.depth is not None
+        self.counts["frames"] += sensed.bundle.frame is not None
+        self.counts["keyframes"] += new
+        self.counts["picks"] += len(sensed.bundle.picks)
+        self._bounded.tidy()
+        self._answer_when_due(sensed.stamp_ns, clicked, busy)
+
+    def look_back(self, sensed: Sensed) -> bool:
+        """A click in a frame that has passed."""
+        taken = self.pipeline.look_back(sensed)
+        self.counts["picks" if taken else "picks_too_late"] += len(sensed.bundle.picks)
+        self._changed |= taken
+        self._answer_when_due(self.engine.end_ns, True, False)
+        return taken
+
+    def freeze(self, on: bool) -> str:
+        """Holds the calibration, or lets it go."""
+        there = held(self.engine)
+        if on and not there:
+            self.engine.state.values = self.engine.solver.update(hold(self.engine))
+        if not on and there:
+            self.engine.state.values = self.engine.solver.switch_off(there)
+        self._changed = True
+        return "the calibration is held" if on else "the calibration may move"
+
+    # Out ------------------------------------------------------------------------------------------------------
+
+    def _answer_when_due(self, stamp_ns: int, at_once: bool, busy: bool) -> None:
+        period = self._settings.answer_period_ns * (5 if busy else 1)
+        if self._next_answer_ns - stamp_ns > 2 * period:
+            self._next_answer_ns = 0  # the clock was set back
+        if stamp_ns < self._next_answer_ns and not at_once:
+            return
+        self._next_answer_ns = stamp_ns + period
+        self.answer(stamp_ns)
+
+    def mark_changed(self) -> None:
+        """The next answer is made anew."""
+        self._changed = True
+
+    def answer(self, stamp_ns: int) -> Answer | None:
+        """Tells what is known now; None while nothing is."""
+        if self._changed or self._answer is None:
+            self._maybe_audit(stamp_ns)
+            made = self._made(stamp_ns)
+            if made is None:
+                return None
+            self._answer, self._changed = made, False
+        else:
+            decisions = self._decisions(self._answer, stamp_ns)
+            self._answer = replace(
+                self._answer, stamp_ns=stamp_ns, decisions=decisions, last_tie_ns=self.engine.boards.last_seen_ns()
+            )
+        self._answer = replace(self._answer, counts=dict(self.counts), cpu_s=time.process_time())
+        self._tell(self._answer)
+        return self._answer
+
+    def _maybe_audit(self, stamp_ns: int) -> None:
+        if stamp_ns < self._next_audit_ns and self._next_audit_ns - stamp_ns <= self._settings.audit_period_ns:
+            return
+        if self.engine.odometry.last_keyframe < 0 or self.engine.unsolved():
+            return
+        self._next_audit_ns = stamp_ns + self._settings.audit_period_ns
+        if self.engine.boards.any_known():
+            self.engine.revisit()
+        try:
+            self._audit = audit(self.engine)
+        except ObservabilityError:
+            self.counts["undetermined"] += 1
+
+    def _made(self, stamp_ns: int) -> Answer | None:
+        engine, state = self.engine, self.engine.state
+        if state.values.size() == 0:
+            return None
+        last = keys.keyframe(engine.odometry.last_keyframe)
+        newest = [last] if state.has(last) else []
+        try:
+            posterior = posterior_of(engine, newest)
+        except ObservabilityError:
+            self.counts["undetermined"] += 1
+            return None
+        answer = Answer(
+            stamp_ns=stamp_ns,
+            keyframe_ns=engine.odometry.keyframe_stamps[-1] if newest else None,
+            places=self._places(posterior, newest),
+            points=self._points(posterior),
+            pipes=self._pipes(posterior),
+            calibration=departures(engine, posterior),
+            events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)[-EVENTS:]),
+            last_tie_ns=engine.boards.last_seen_ns(),
+            consistent=self._audit.consistency.passed,
+            reasons=self._audit.consistency.reasons,
+        )
+        self._forget_pictures()
+        return replace(answer, decisions=self._decisions(answer, stamp_ns))
+
+    def _places(self, posterior: Posterior, newest: list[int]) -> dict[str, Place]:
+        named = {board.id: self.engine.boards.key(board.id) for board in self.rig.boards}
+        named = {"b": keys.base(0), **named, **({"m": newest[0]} if newest else {})}
+        return {
+            name: Place(posterior.values.atPose3(key).matrix(), posterior.marginal(key))
+            for name, key in named.items()
+            if key in posterior.columns
+        }
+
+    def _points(self, posterior: Posterior) -> tuple[PointEstimate, ...]:
+        base, found = keys.base(0), []
+        for point in self.engine.pipes.points.values():
+            key = keys.point(point.index)
+            if not point.known or base not in posterior.columns or key not in posterior.columns:
+                continue
+            position, blocks = point_blocks(posterior.values, base, key)
+            covariance = posterior.covariance(blocks) * self._audit.widening.get(point.id, 1.0)
+            axis = self._axis(posterior, point.pipe) if point.on_axis else None
+            found.append(
+                PointEstimate(
+                    id=point.id,
+                    role=point.role,
+                    frame="b",
+                    position_m=position,
+                    covariance_m2=covariance,
+                    radius95_m=radius95(covariance),
+                    measurements=point.picks,
+                    axis=axis,
+                    pipe_id=point.pipe if point.on_axis else None,
+                )
+            )
+        return tuple(found)
+
+    def _axis(self, posterior: Posterior, pipe: str | None) -> Float | None:
+        cylinder = self.engine.pipes.cylinders.get(pipe or "")
+        if cylinder is None or keys.axis_start(cylinder.index) not in posterior.columns:
+            return None
+        values = posterior.values
+        span = values.atPoint3(keys.axis_end(cylinder.index)) - values.atPoint3(keys.axis_start(cylinder.index))
+        turned = values.atPose3(keys.base(0)).rotation().matrix().T @ span
+        return turned / np.linalg.norm(turned)
+
+    def _pipes(self, posterior: Posterior) -> tuple[PipeEstimate, ...]:
+        base, found = keys.base(0), []
+        for name, cylinder in self.engine.pipes.cylinders.items():
+            if not cylinder.known or not {base, keys.radius(cylinder.index)} <= posterior.columns.keys():
+                continue
+            o_T_b = posterior.values.atPose3(base)
+            places = [o_T_b.transformTo(p) for p in self.engine.pipes.places(name)]
+            near = np.mean(places, axis=0) if places else np.zeros(3)
+            found.append(pipe_estimate(name, "b", cylinder.index, base, near, posterior.values, posterior))
+        return tuple(found)
+
+    def _decisions(self, answer: Answer, now_ns: int) -> tuple[Decision, ...]:
+        """The cut plan's verdicts, with what the time since the last look at a board adds."""
+        if not self.rig.cut_plan:
+            return ()
+        tie = answer.last_tie_ns
+        age_s = 0.0 if tie is None else (now_ns - tie) / S
+        points = []
+        for p in answer.points:
+            covariance = grown(p.covariance_m2, p.position_m, age_s, self._settings)
+            points.append(replace(p, covariance_m2=covariance, radius95_m=radius95(covariance)))
+        start = PoseEstimate("m", "o", self._first_ns or now_ns, np.eye(4), None)
+        result = Result(
+            points=tuple(points), poses=(), trajectory=(start,), pipes=answer.pipes, calibration=(), distances=(),
+            consistency=self._audit.consistency, rejected=(), events=answer.events, streaming_difference_sigma={},
+            timing={}, provenance={}, config_yaml="", last_board_view_ns=tie, end_ns=now_ns,
+        )  # fmt: skip
+        return decide(result, self.rig, self._validated)
+
+    def _forget_pictures(self) -> None:
+        pictures = self.engine.pick_images
+        for key in list(pictures)[:-PICTURES]:
+            del pictures[key]
+        del self.engine.picks[:-1000]
+
+    # Memory ---------------------------------------------------------------------------------------------------
+
+    def checkpoint_when_due(self) -> None:
+        """Writes the file every few seconds; a full disk is counted, not fatal."""
+        now = time.monotonic()
+        if self._checkpoint is None or now - self._saved_s < self._settings.checkpoint_period_s:
+            return
+        try:
+            self.save()
+        except SurecutError:
+            self.counts["checkpoint_errors"] += 1
+        self._saved_s = now
+
+    def save(self) -> str:
+        """Writes the checkpoint now.
+
+        Raises:
+            SurecutError: there is no place for it, nothing to remember, or the disk is full.
+        """
+        if self._checkpoint is None:
+            raise SurecutError("there is no file to save to; start with --checkpoint FILE")
+        memory = remember(self.engine)
+        if memory is None:
+            raise SurecutError("nothing to remember yet: no board has a place")
+        save(memory, self._checkpoint, self._rig_sha256)
+        self.counts["checkpoints"] += 1
+        return f"saved to {self._checkpoint}"

@@ -1,0 +1,107 @@
+"""The graph's process: GTSAM holds the interpreter while it solves, so it has one of its own."""
+
+import queue
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...factors.errors import SurecutError
+from ...factors.rig import Rig
+from ..sensing import Sensed
+from ..validated_range import ValidatedRange
+from .graph_loop import GraphLoop
+from .memory import load
+from .parent import end_with_parent
+from .settings import StreamSettings
+from .wire import Died, Done, LateClick, Order, Ready
+
+BUSY = 20
+"""Stamps that wait from which on answers are rarer."""
+
+
+@dataclass(frozen=True, slots=True)
+class GraphTask:
+    """What the process is started with."""
+
+    rig: Rig
+    settings: StreamSettings
+    prior: Path | None
+    """A checkpoint to begin with."""
+    checkpoint: Path | None
+    validated: ValidatedRange | None
+
+
+def solve(task: GraphTask, inbox: Any, out: Any) -> None:
+    """The process."""
+    end_with_parent()
+    try:
+        loop = _started(task, out, task.prior)
+        out.put(Ready("graph"))
+        while True:
+            try:
+                item = inbox.get(timeout=0.5)
+            except queue.Empty:
+                loop.checkpoint_when_due()
+                continue
+            if isinstance(item, Sensed):
+                loop.take(item, _waiting(inbox) > BUSY)
+            elif isinstance(item, LateClick):
+                _look_back(loop, item, out)
+            elif isinstance(item, Order):
+                if item.what == "finish":
+                    _finish(loop, out)
+                    return
+                loop = _obeyed(loop, item, task, out)
+            loop.checkpoint_when_due()
+    except Exception:
+        out.put(Died("graph", traceback.format_exc()))
+
+
+def _started(task: GraphTask, out: Any, prior: Path | None) -> GraphLoop:
+    memory = load(prior) if prior is not None and prior.exists() else None
+    loop = GraphLoop(task.rig, task.settings, out.put, memory, task.checkpoint, task.validated)
+    if memory is not None:
+        loop.answer(memory.stamp_ns)
+    return loop
+
+
+def _waiting(inbox: Any) -> int:
+    try:
+        return inbox.qsize()
+    except NotImplementedError:  # macOS cannot tell
+        return 0
+
+
+def _look_back(loop: GraphLoop, item: LateClick, out: Any) -> None:
+    if not loop.look_back(item.sensed):
+        pick = item.sensed.bundle.picks[0]
+        text = f"pick {pick.point_id} at {pick.stamp_ns} ns: its frame cannot be placed any more; pick in a newer image"
+        out.put(Done("pick", text, failed=True))
+
+
+def _obeyed(loop: GraphLoop, order: Order, task: GraphTask, out: Any) -> GraphLoop:
+    try:
+        if order.what == "reset":
+            loop = _started(task, out, None)
+            out.put(Done("reset", "map, poses and points are forgotten"))
+        elif order.what == "save":
+            out.put(Done("save", loop.save()))
+        else:
+            out.put(Done(order.what, loop.freeze(order.what == "freeze")))
+    except SurecutError as error:
+        out.put(Done(order.what, str(error), failed=True))
+    return loop
+
+
+def _finish(loop: GraphLoop, out: Any) -> None:
+    """The last answer, with everything that waited."""
+    loop.pipeline.complete()
+    loop.engine.flush()
+    loop.mark_changed()
+    loop.answer(loop.engine.end_ns)
+    try:
+        text = loop.save()
+    except SurecutError as error:
+        text = str(error)
+    out.put(Done("finish", text))

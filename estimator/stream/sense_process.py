@@ -1,0 +1,142 @@
+"""The front ends' process: groups of messages in; each frame's motion out at once, then what was seen to the graph."""
+
+import time
+import traceback
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ...factors.errors import SurecutError
+from ...factors.measurements import MarkerSighting, StereoFrame
+from ...factors.rig import Rig
+from ...frontends.undistort import distort
+from ...io.live.interfaces import Outline
+from ...io.messages import Message, PickBody
+from ...io.pairing import StereoPair
+from ..sensing import Item, Sensing, images
+from ..sensors import PairImages
+from .parent import end_with_parent
+from .settings import StreamSettings
+from .wire import Died, Frame, Group, LateClick, Order, Ready, Worked
+
+
+def sense(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) -> None:
+    """The process. `inbox`, `graph` and `out` are queues between processes."""
+    end_with_parent()
+    cv2.setNumThreads(1)
+    try:
+        loop = SenseLoop(rig, settings, graph, out)
+        out.put(Ready("front ends"))
+        while True:
+            item = inbox.get()
+            if isinstance(item, Group):
+                loop.take(item.items)
+            elif isinstance(item, Order):
+                graph.put(item)
+                if item.what == "finish":
+                    return
+                if item.what == "reset":
+                    loop = SenseLoop(rig, settings, graph, out, loop.calibrations)
+    except Exception:
+        out.put(Died("front ends", traceback.format_exc()))
+
+
+@dataclass(frozen=True, slots=True)
+class Recent:
+    """A frame that somebody may still click in."""
+
+    pair: PairImages
+    frame: StereoFrame
+
+
+class SenseLoop:
+    """Works on one group after the other.
+
+    Args:
+        calibrations: messages by topic that a fresh start has to be told again.
+    """
+
+    def __init__(
+        self, rig: Rig, settings: StreamSettings, graph: Any, out: Any, calibrations: dict[str, Message] | None = None
+    ) -> None:
+        self._sensing = Sensing(rig)
+        self._settings = settings
+        self._graph = graph
+        self._out = out
+        self._recent: OrderedDict[int, Recent] = OrderedDict()
+        self._newest_ns = 0
+        self._pair: StereoPair | None = None
+        self.calibrations: dict[str, Message] = {}
+        for message in (calibrations or {}).values():
+            self.take([message])
+
+    def take(self, items: list[Item]) -> None:
+        """A group. Whatever is wrong with it is told, and the stream goes on."""
+        began = time.process_time()
+        problem, outlines, picks = None, {}, 0
+        stamp_ns = items[0].stamp_ns
+        try:
+            clicks = [item for item in items if isinstance(item, Message) and _on_mobile(item)]
+            if len(clicks) == len(items):
+                picks = len(clicks)
+                self._late(clicks)
+            else:
+                outlines = self._present(items)
+        except SurecutError as error:
+            problem = " ".join(str(error).split())
+        self._out.put(Worked(outlines, stamp_ns, problem, picks, time.process_time() - began))
+
+    def _present(self, items: list[Item]) -> dict[str, tuple[Outline, ...]]:
+        self._note(items)
+        sensed = self._sensing.process(items, self._tracked)
+        self._remember(sensed.bundle.frame)
+        self._graph.put(sensed)
+        return self._outlines(sensed.bundle.sightings)
+
+    def _note(self, items: list[Item]) -> None:
+        for item in items:
+            if isinstance(item, StereoPair):
+                self._pair = item
+            elif self._sensing.is_calibration(item):
+                self.calibrations[item.topic] = item
+
+    def _tracked(self, frame: StereoFrame) -> None:
+        self._out.put(Frame(frame.stamp_ns, frame.last_T_this, frame.is_keyframe, frame.lost, frame.motion_inliers))
+
+    def _remember(self, frame: StereoFrame | None) -> None:
+        if frame is None or self._pair is None:
+            return
+        self._recent[frame.stamp_ns] = Recent(images(self._pair), frame)
+        self._newest_ns = frame.stamp_ns
+        while self._recent and next(iter(self._recent)) < frame.stamp_ns - self._settings.recent_ns:
+            self._recent.popitem(last=False)
+
+    def _late(self, clicks: list[Message]) -> None:
+        """Clicks in a frame that has passed: with its pictures, so that the graph may make it a keyframe."""
+        stamp_ns = clicks[0].stamp_ns if clicks[0].stamp_ns > 0 else self._newest_ns
+        recent = self._recent.get(self._nearest(stamp_ns))
+        if recent is None:
+            self._graph.put(self._sensing.process(list(clicks)))
+            return
+        own = [replace(click, stamp_ns=recent.frame.stamp_ns) for click in clicks]
+        self._graph.put(LateClick(self._sensing.look_back(own, recent.pair, recent.frame)))
+
+    def _nearest(self, stamp_ns: int) -> int:
+        """Stamp of the remembered frame within a millisecond."""
+        return min((s for s in self._recent if abs(s - stamp_ns) <= 1_000_000), default=-1)
+
+    def _outlines(self, sightings: tuple[MarkerSighting, ...]) -> dict[str, tuple[Outline, ...]]:
+        """Markers in raw pixels, for people."""
+        found: dict[str, list[Outline]] = {}
+        for s in sightings:
+            camera = self._sensing.sensors.cameras[s.camera]
+            raw = np.asarray(distort(camera, s.corners_px), float)
+            found.setdefault(s.camera, []).append(Outline(f"{s.board}/{s.marker}", raw, True))
+        return {camera: tuple(outlines) for camera, outlines in found.items()}
+
+
+def _on_mobile(message: Message) -> bool:
+    return isinstance(message.body, PickBody) and message.body.camera != "b_rgb"

@@ -1,0 +1,134 @@
+"""Keyframes that leave the graph leave what they said: the same answer, at a cost that does not grow."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from surecut.estimator.bounded import Bounded, Limits
+from surecut.estimator.bundle import bundles
+from surecut.estimator.engine import Engine
+from surecut.estimator.marginal import FAMILY, gaussian_of, marginal
+from surecut.estimator.points_in_base import point_blocks
+from surecut.estimator.surfaces import lay_on_surfaces
+from surecut.factors import keys
+from surecut.simulation.measurement_level import draw
+from surecut.simulation.measurement_level_scenario import Scenario
+
+
+def linear_graph():
+    """Eight points, each tied to each: linear, so that elimination is exact."""
+    rng = np.random.default_rng(5)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    points = [keys.landmark(i) for i in range(8)]
+    for i, key in enumerate(points):
+        values.insert(key, rng.normal(size=3))
+        for j, other in enumerate(points[:i]):
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.1 + 0.1 * (i + j))
+            graph.add(gtsam.BetweenFactorPoint3(other, key, rng.normal(size=3), noise))
+    graph.add(gtsam.PriorFactorPoint3(points[0], np.ones(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.2)))
+    return graph, values, points
+
+
+def optimum(graph, values):
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    return found, gtsam.Marginals(graph, found)
+
+
+def rest_of(graph, gone):
+    return [graph.at(i) for i in range(graph.size()) if not gone.intersection(graph.at(i).keys())]
+
+
+def test_elimination_is_exact_where_the_problem_is_linear():
+    graph, values, points = linear_graph()
+    gone = set(points[:4])
+    rest = rest_of(graph, gone)
+    touched = [graph.at(i) for i in range(graph.size()) if gone.intersection(graph.at(i).keys())]
+    small = gtsam.NonlinearFactorGraph()
+    small.add(marginal(touched, values, gone).factor())
+    start = gtsam.Values()
+    for factor in rest:
+        small.add(factor)
+    for key in points[4:]:
+        start.insert(key, values.atPoint3(key) + 0.7)
+    whole, whole_covariance = optimum(graph, values)
+    part, part_covariance = optimum(small, start)
+    for key in points[4:]:
+        np.testing.assert_allclose(part.atPoint3(key), whole.atPoint3(key), atol=1e-7)
+        np.testing.assert_allclose(
+            part_covariance.marginalCovariance(key), whole_covariance.marginalCovariance(key), atol=1e-9
+        )
+
+
+def test_joint_gaussian_of_some_variables_as_one_factor_again():
+    graph, values, points = linear_graph()
+    prior = gaussian_of(graph, values, points[5:])
+    assert prior.H.shape == (9, 9)
+    small = gtsam.NonlinearFactorGraph()
+    small.add(prior.factor())
+    start = gtsam.Values()
+    for key in points[5:]:
+        start.insert(key, np.zeros(3))
+    whole, _ = optimum(graph, values)
+    part, covariance = optimum(small, start)
+    joint = gtsam.Marginals(graph, whole)
+    for key in points[5:]:
+        np.testing.assert_allclose(part.atPoint3(key), whole.atPoint3(key), atol=1e-6)
+        np.testing.assert_allclose(
+            covariance.marginalCovariance(key), joint.marginalCovariance(key), rtol=1e-6, atol=1e-9
+        )
+
+
+def points_in_base(engine):
+    """Positions and covariances in {b}, from the joint."""
+    found = {}
+    for point in engine.pipes.points.values():
+        position, blocks = point_blocks(engine.state.values, keys.base(0), keys.point(point.index))
+        joint = engine.solver.joint_covariance([key for key, _ in blocks])
+        jacobian = np.hstack([block for _, block in blocks])
+        found[point.id] = position, jacobian @ joint @ jacobian.T
+    return found
+
+
+@pytest.fixture(scope="module")
+def run():
+    scenario = {"motion": {"duration_s": 30.0, "returns": True}, "tracks": {"per_frame": 50}}
+    return draw(Scenario.model_validate(scenario), 2)
+
+
+def estimated(run, limits):
+    engine = Engine(run.rig, run.cameras, lay_on_surfaces)
+    bounded = Bounded(engine, limits)
+    for bundle in bundles(run.measurements):
+        engine.add(bundle)
+        bounded.tidy()
+    engine.revisit()
+    engine.flush()
+    engine.state.values = engine.solver.settle(10)
+    return engine, bounded
+
+
+def test_window_gives_the_answer_of_the_whole_graph(run):
+    whole, untouched = estimated(run, Limits())
+    count = whole.odometry.last_keyframe + 1
+    small, bounded = estimated(run, Limits(keyframes=2 * count // 3, step=count // 6, map_landmarks=20))
+    assert untouched.rebuilt == 0
+    assert bounded.rebuilt >= 2
+    expected, found = points_in_base(whole), points_in_base(small)
+    assert found.keys() == expected.keys()
+    assert found
+    for name, (position, covariance) in expected.items():
+        sigma = np.sqrt(np.diag(covariance))
+        assert np.abs(found[name][0] - position).max() < 0.1 * sigma.min(), name
+        np.testing.assert_allclose(np.sqrt(np.diag(found[name][1])), sigma, rtol=0.03)
+    nothing_hangs_on_what_has_left(small, bounded)
+
+
+def nothing_hangs_on_what_has_left(engine, bounded):
+    records = [record.family for _, _, record in engine.solver.log.active()]
+    assert records.count(FAMILY) == 1
+    poses = [key for key in engine.state.values.keys() if keys.kind(key) == "x"]
+    assert len(poses) <= bounded.limits.keyframes + 1
+    assert {keys.index(key) for key in poses} == set(engine.keyframe_at.values())
+    assert bounded.first > 0
+    marks = {keys.index(key) for key in engine.state.values.keys() if keys.kind(key) == "l"}
+    assert set(engine.odometry.observations) <= marks

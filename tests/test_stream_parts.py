@@ -1,0 +1,264 @@
+"""The parts of the stream by themselves: order of live messages, health by name, poses between keyframes, trust."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from surecut.estimator.decision import Decision
+from surecut.estimator.stream.follower import Follower
+from surecut.estimator.stream.health import Monitor
+from surecut.estimator.stream.ordering import LiveOrder
+from surecut.estimator.stream.settings import StreamSettings
+from surecut.estimator.stream.trust import EXPIRED, grown, verdict_of
+from surecut.estimator.stream.wire import Answer, Frame, Place
+from surecut.factors.measurements import Event
+from surecut.factors.rig import Cut, Rig
+from surecut.io.live.interfaces import HealthState
+from surecut.io.messages import ImageBody, Message, PickBody
+from surecut.io.pairing import StereoPair
+from surecut.io.pixels import RawPixels
+
+RIG = Rig()
+LEFT, RIGHT = RIG.cameras.m_left.image_topic, RIG.cameras.m_right.image_topic
+MS = 1_000_000
+START = 1_700_000_000_000_000_000
+
+
+def image(topic, stamp_ms, value=0, arrived_ms=None):
+    pixels = RawPixels("mono8", 4, 2, 4, False, np.full(8, value % 251, np.uint8))
+    arrived = stamp_ms if arrived_ms is None else arrived_ms
+    return Message(topic, START + round(arrived * MS), START + round(stamp_ms * MS), "m", ImageBody(pixels, topic))
+
+
+def click(stamp_ms, name="P1", camera="m_left"):
+    stamp = START + stamp_ms * MS if stamp_ms is not None else 0
+    return Message(RIG.picks_topic, START, stamp, camera, PickBody(camera, name, "cut", np.ones(2), 1.0))
+
+
+class Feed:
+    """An order with a clock, ms."""
+
+    def __init__(self):
+        self.order = LiveOrder(RIG, 100 * MS)
+        self.pairs = []
+        self.clicks = []
+
+    def add(self, message, now_ms):
+        self.take(self.order.add(message, START + round(now_ms * MS)))
+
+    def tick(self, now_ms):
+        self.take(self.order.due(START + round(now_ms * MS)))
+
+    def take(self, groups):
+        for group in groups:
+            stamp = (group[0].stamp_ns - START) // MS
+            if isinstance(group[0], StereoPair):
+                self.pairs.append(stamp)
+            found = [i.body.point_id for i in group if isinstance(i, Message) and isinstance(i.body, PickBody)]
+            if found:
+                self.clicks.append((stamp, isinstance(group[0], StereoPair), found))
+
+    def pair(self, stamp_ms, now_ms):
+        self.add(image(LEFT, stamp_ms), now_ms)
+        self.add(image(RIGHT, stamp_ms), now_ms)
+
+    def steady(self, count):
+        for i in range(count):
+            self.pair(50 * i, 50 * i + 5)
+            self.tick(50 * i + 6)
+        return 50 * count
+
+
+def test_whole_pairs_in_rhythm_pass_at_once():
+    feed = Feed()
+    at = feed.steady(6)
+    assert feed.pairs == [0, 50, 100, 150, 200, 250][: len(feed.pairs)]
+    before = len(feed.pairs)
+    feed.pair(at, at + 5)
+    feed.tick(at + 6)
+    assert len(feed.pairs) == before + 1
+    assert feed.pairs[-1] == at
+
+
+def test_late_frame_inside_the_window_keeps_its_place():
+    feed = Feed()
+    at = feed.steady(6)
+    feed.pair(at + 50, at + 55)  # the one before is missing
+    feed.tick(at + 70)
+    assert at + 50 not in feed.pairs
+    feed.pair(at, at + 90)
+    feed.tick(at + 91)
+    assert feed.pairs[-2:] == [at, at + 50]
+    assert feed.order.counts["late"] == 0
+
+
+def test_missing_frame_is_waited_for_no_longer_than_the_window():
+    feed = Feed()
+    at = feed.steady(6)
+    feed.pair(at + 50, at + 55)
+    feed.tick(at + 156)
+    assert feed.pairs[-1] == at + 50
+    feed.pair(at, at + 170)
+    feed.tick(at + 300)
+    assert at not in feed.pairs
+    assert feed.order.counts["late"] == 2
+
+
+def test_half_a_pair_is_counted():
+    feed = Feed()
+    at = feed.steady(6)
+    feed.add(image(LEFT, at), at + 5)
+    feed.tick(at + 120)
+    assert feed.order.counts["unpaired"] == 1
+
+
+def test_click_joins_its_frame_or_comes_as_a_late_one():
+    feed = Feed()
+    at = feed.steady(4)
+    feed.add(click(at), at)
+    feed.add(click(50, "P2"), at + 1)
+    feed.add(click(50, "P3"), at + 2)
+    feed.tick(at + 30)
+    feed.pair(at, at + 31)
+    feed.tick(at + 32)
+    assert (50, False, ["P2", "P3"]) in feed.clicks
+    assert (at, True, ["P1"]) in feed.clicks
+
+
+def test_stamp_from_the_future_stops_nothing_and_a_set_clock_is_followed():
+    feed = Feed()
+    at = feed.steady(6)
+    feed.add(image(LEFT, at + 3_600_000), at)
+    feed.pair(at, at + 5)
+    feed.tick(at + 6)
+    assert feed.pairs[-1] == at
+    assert feed.order.counts["stamp_outlier"] == 1
+    for i in range(12):  # the camera's clock was set back by an hour
+        feed.pair(at + 50 * i - 3_600_000, at + 50 * i)
+    feed.tick(at + 1000)
+    assert feed.order.counts["clock_jumps"] == 1
+    assert feed.pairs[-1] == at + 550 - 3_600_000
+
+
+# Health ---------------------------------------------------------------------------------------------------------------
+
+
+def names(health):
+    return {fault.name for fault in health.faults}
+
+
+def fed(monitor, start_ms, stop_ms, value=lambda ms: ms, shift_ms=0):
+    for ms in range(start_ms, stop_ms, 50):
+        for topic in (LEFT, RIGHT):
+            monitor.heard(image(topic, ms + shift_ms, value(ms), ms), START + ms * MS)
+
+
+@pytest.fixture
+def monitor():
+    monitor = Monitor(RIG, StreamSettings())
+    fed(monitor, 0, 2000)
+    monitor.answered(Answer(START, START, {}))
+    return monitor
+
+
+def state(monitor, ms):
+    return monitor.health(START + ms * MS, START + ms * MS)
+
+
+def test_healthy(monitor):
+    assert state(monitor, 2000).state is HealthState.OK
+
+
+def test_frozen_camera_is_named_within_two_seconds(monitor):
+    fed(monitor, 2000, 4000, value=lambda ms: 7)
+    assert f"camera_frozen {LEFT}" in names(state(monitor, 4000))
+    fed(monitor, 4000, 4500)
+    assert not names(state(monitor, 4500))
+
+
+def test_silent_topic_is_named_within_two_seconds(monitor):
+    assert f"topic_missing {RIGHT}" in names(state(monitor, 3950))
+    assert state(monitor, 3950).state is HealthState.FAILED
+
+
+@pytest.mark.parametrize("seconds", [1.0, -30.0])
+def test_clock_jump_is_named_within_two_seconds(monitor, seconds):
+    fed(monitor, 2000, 4000, shift_ms=round(1e3 * seconds))
+    assert f"clock_jump {LEFT}" in names(state(monitor, 4000))
+
+
+def test_jitter_is_no_clock_jump(monitor):
+    for i in range(60):
+        ms = 2000 + 50 * i
+        late = 800 if i % 5 else 0  # most messages come late, some do not
+        monitor.heard(image(LEFT, ms, i, ms + late), START + (ms + late) * MS)
+    assert not any(name.startswith("clock_jump") for name in names(state(monitor, 5000)))
+
+
+def test_pairs_apart_and_knocks_are_named(monitor):
+    order = LiveOrder(RIG, 100 * MS)
+    for i in range(60):
+        order.add(image(LEFT, 50 * i), START + 50 * i * MS)
+        order.add(image(RIGHT, 50 * i + 20), START + (50 * i + 20) * MS)
+    monitor.paired(order.unpaired)
+    knock = Event(START + 1000 * MS, "board_knocked", "board f0 was knocked", "warning")
+    monitor.answered(Answer(START, START, {}, events=(knock,)))
+    fed(monitor, 2000, 2200)
+    assert {"pair_apart", "board_knocked"} <= names(state(monitor, 2200))
+
+
+# Poses and trust ------------------------------------------------------------------------------------------------------
+
+
+def step(x_m):
+    return gtsam.Pose3(gtsam.Rot3(), np.array([x_m, 0.0, 0.0])).matrix()
+
+
+def frame(number, keyframe=False, lost=False):
+    return Frame(START + number * 50 * MS, step(0.01), keyframe, lost, 50)
+
+
+def test_pose_between_keyframes_and_its_covariance():
+    follower = Follower()
+    assert follower.frame(frame(0, True)) is None
+    follower.frame(frame(1))
+    own = 1e-6 * np.eye(6)
+    placed = follower.anchor(START, Place(step(1.0), own))
+    np.testing.assert_allclose(placed.matrix, step(1.01), atol=1e-12)
+    sizes = [np.trace(placed.covariance)]
+    for i in range(2, 6):
+        followed = follower.frame(frame(i, keyframe=True))
+        np.testing.assert_allclose(followed.matrix, step(1.0 + 0.01 * i), atol=1e-12)
+        sizes.append(np.trace(followed.covariance))
+    assert (np.diff(sizes) > 0).all()
+    lost = follower.frame(frame(6, lost=True))
+    assert np.sqrt(lost.covariance[3, 3]) > 0.02  # half a metre per second, for a twentieth
+
+
+def test_wrong_motions_widen_the_pose():
+    good, bad = Follower(), Follower()
+    for follower, off in ((good, 0.0), (bad, 0.02)):
+        for i in range(60):
+            follower.frame(frame(i, keyframe=True))
+            # the graph says that each step was longer than the front end did
+            follower.anchor(frame(i).stamp_ns, Place(step((0.01 + off) * i), 1e-8 * np.eye(6)))
+    sizes = [np.sqrt(f.frame(frame(60, keyframe=True)).covariance[3, 3]) for f in (good, bad)]
+    assert sizes[1] == pytest.approx(0.02, rel=0.15)
+    assert sizes[0] < 0.2 * sizes[1]
+
+
+def test_covariance_grows_as_its_formula_says():
+    settings = StreamSettings(unseen_walk_m_per_root_s=0.001, unseen_turn_rad_per_root_s=0.01)
+    covariance = grown(np.zeros((3, 3)), np.array([0.0, 0.0, 2.0]), 4.0, settings)
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [np.hypot(0.002, 0.04)] * 2 + [0.002], rtol=1e-9)
+
+
+def test_verdict_expires():
+    cut = Cut(point="P1", tolerance_along_m=0.01, tolerance_across_m=0.01, board_age_limit_s=30.0)
+    decision = Decision(cut, "GO", "Cut P1.", 0.99, 0.95, 1.0, (), (), 2.0, START + 30_000 * MS)
+    assert verdict_of(decision, START + 29_000 * MS)[0] == "GO"
+    assert verdict_of(decision, START + 31_000 * MS)[0] == EXPIRED
+    assert verdict_of(replace(decision, expires_ns=None), START)[0] == EXPIRED
+    assert verdict_of(None, START)[0] == "MEASURE MORE"
