@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+import cv2
+
 from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
@@ -130,6 +132,7 @@ class SensedElsewhere:
 
 def _sense(log: Path, rig: Rig, out: Any) -> None:
     """The process: reads, senses, and hands over what it saw or what went wrong."""
+    cv2.setNumThreads(1)  # the graph has the other core
     here = SensedHere(log, rig)
     try:
         for sensed in here:
