@@ -115,6 +115,10 @@ def fit_board(
     pose, damping = start.copy(), 1e-4
     error, jacobian = _linearise(corners, camera, root, pose, side_m, extra, side_free, shifted)
     cost = float(error @ error)
+    if not (np.isfinite(cost) and np.isfinite(jacobian).all()):  # the start puts corners into the camera's plane
+        unknowns = 6 + len(extra)
+        nothing = np.full((unknowns, unknowns), np.inf)
+        return BoardFit(pose, extra, nothing, np.full((len(error) // 2, 2), np.inf), np.inf, len(error) - unknowns)
     for _ in range(_STEPS):
         normal, right = jacobian.T @ jacobian, jacobian.T @ error
         step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), right)
