@@ -23,7 +23,7 @@ OUTLINE_VIEWS = 16
 """Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.006, 0.02, 0.008)
+OUTLINE_PRIOR = (0.006, 0.02, 0.004)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
