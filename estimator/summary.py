@@ -28,6 +28,7 @@ from .board_inspection import FAMILY as CORNERS
 from .calibration_states import depth_focal_px
 from .consistency import family_tests, judge, prior_tests
 from .engine import Engine, distance_name
+from .leave_out import without_families
 from .marker_points import parse_point
 from .motions import motions
 from .mount_check import compared_with_cloud
@@ -48,6 +49,9 @@ from .surroundings import Surroundings, compact_map, nearest_surface, surroundin
 Float = NDArray[np.float64]
 INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
 """Names of the intrinsics' components; the skew is not reported."""
+
+LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "picks")
+"""Families without each of which there may still be an estimate to compare with."""
 
 
 class Summary:
@@ -367,7 +371,16 @@ class Summary:
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
         cylinders, ways = compared_with_cloud(self._engine, self._active, self._system, self._values)
-        return judge(families, [*priors, *cylinders], {**paths, **ways})
+        return judge(families, [*priors, *cylinders], {**paths, **ways, **self._left_out()})
+
+    def _left_out(self) -> dict[str, float]:
+        """How far each point moves without one family of measurements, in sigmas."""
+        known = [p for p in self._engine.pipes.points.values() if p.known]
+        if not known or not self._values.exists(self._engine.base):
+            return {}
+        blocks = {p.id: point_blocks(self._values, self._engine.base, keys.point(p.index))[1] for p in known}
+        found = without_families(self._active, self._system, blocks, LEFT_OUT)
+        return {f"{point} without {family}": sigma for (point, family), sigma in found.items()}
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""
