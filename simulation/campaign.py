@@ -31,21 +31,30 @@ class Campaign:
     leave_out: bool = False
     decisions: bool = False
     sensitivity: bool = False
+    recordings: Path | None = None
+    """Folder that keeps the rendered recordings, to run a later estimator on the same ones."""
 
     def order(self, number: int) -> RunOrder:
         """The order of one run."""
         scenario = self.scenarios[number % len(self.scenarios)]
-        return RunOrder(number, self.level, scenario, self.leave_out, self.decisions, self.sensitivity)
+        return RunOrder(number, self.level, scenario, self.leave_out, self.decisions, self.sensitivity, self.recordings)
 
 
 def open_campaign(
-    source: str, level: Level, leave_out: bool = False, decisions: bool = False, sensitivity: bool = False
+    source: str,
+    level: Level,
+    leave_out: bool = False,
+    decisions: bool = False,
+    sensitivity: bool = False,
+    recordings: Path | None = None,
 ) -> Campaign:
     """A campaign from a scenario file or the name of one that comes with surecut.
 
     Raises:
         SurecutError: there is no such scenario, or something in it is wrong.
     """
+    if recordings is not None:
+        recordings.mkdir(parents=True, exist_ok=True)
     if level == "pixels":
         found = tuple(scenario.model_dump(mode="json") for scenario in load_pixel_scenarios(source))
     else:
@@ -54,7 +63,7 @@ def open_campaign(
             names = ", ".join(sorted(one.stem for one in SCENARIOS.glob("*.yaml")))
             raise SurecutError(f"{source}: no such scenario; give a YAML file or one of {names}")
         found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(path))
-    return Campaign(level, found, leave_out, decisions, sensitivity)
+    return Campaign(level, found, leave_out, decisions, sensitivity, recordings)
 
 
 def run_campaign(

@@ -25,13 +25,26 @@ POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
 POINTS = "/truth/points"
 
 
-def run_pixels(number: int, scenario: Mapping[str, Any]) -> Row:
-    """Renders with the run's number as seed, into a folder that is gone afterwards."""
+def run_pixels(number: int, scenario: Mapping[str, Any], recordings: Path | None = None) -> Row:
+    """Renders with the run's number as seed.
+
+    Args:
+        recordings: folder that keeps the recordings; one that is there already is not rendered again.
+            Without it they are gone afterwards.
+    """
     wanted = Scenario.model_validate(dict(scenario))
-    with TemporaryDirectory(prefix="surecut-campaign-") as folder:
-        log = Path(folder) / "run.mcap"
-        simulate(log, wanted, number, workers=1)
-        return row_of_log(number, wanted.name, log)
+    if recordings is None:
+        with TemporaryDirectory(prefix="surecut-campaign-") as folder:
+            return row_of_log(number, wanted.name, rendered(Path(folder), number, wanted))
+    return row_of_log(number, wanted.name, rendered(recordings, number, wanted))
+
+
+def rendered(folder: Path, number: int, scenario: Scenario) -> Path:
+    """The recording of a run, rendered where it is not there yet."""
+    log = folder / f"{number:05d}-{scenario.name}.mcap"
+    if not log.exists():
+        simulate(log, scenario, number, workers=1)
+    return log
 
 
 def row_of_log(number: int, name: str, log: Path) -> Row:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -33,12 +34,14 @@ class RunOrder:
     leave_out: bool = False
     decisions: bool = False
     sensitivity: bool = False
+    recordings: Path | None = None
+    """Folder that keeps what is rendered."""
 
 
 def run(order: RunOrder) -> Row:
     """One run. What the input cannot give is a row with its reason; a defect raises."""
     if order.level == "pixels":
-        return run_pixels(order.number, order.scenario)
+        return run_pixels(order.number, order.scenario, order.recordings)
     return run_measurements(
         order.number,
         Scenario.model_validate(order.scenario),

@@ -42,6 +42,9 @@ def command(
     sensitivity: Annotated[
         bool, typer.Option("--sensitivity", help="Change one input after the other: how far do the points move?")
     ] = False,
+    recordings: Annotated[
+        Path | None, typer.Option(help="Folder that keeps what `--level pixels` renders; what is there is used again.")
+    ] = None,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
     range_file: Annotated[
@@ -53,7 +56,7 @@ def command(
     if real is not None:
         _real(console, real, output, validation, choose_executor(jobs, dask))
         return
-    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity)
+    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity, recordings)
     with _bar(console) as progress:
         task = progress.add_task("runs", total=runs)
         executor = choose_executor(jobs, dask)
