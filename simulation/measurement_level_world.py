@@ -28,6 +28,8 @@ class World:
     place_stamps_ns: tuple[int, ...]
     points_w: dict[str, Float]
     rng: np.random.Generator
+    outlier_rng: np.random.Generator
+    """Of its own, so that a run with outliers has the scene and noise of the one without."""
 
 
 def project(camera: TrueCamera, w_T_camera: Float, points_w: Float) -> tuple[Float, Float]:
