@@ -141,7 +141,7 @@ class Incremental:
             values = optimiser.optimize()
             self._isam = gtsam.ISAM2(_parameters("QR"))
             self._isam.update(graph, values)
-        self._values = self._isam.calculateEstimate()
+            self._values = self._isam.calculateEstimate()
 
     def values(self) -> gtsam.Values:
         """The estimate over the factors of the log."""
