@@ -7,7 +7,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from ..executor import single_threaded_children
+from ..threads import single_threaded_children
 from .graph_process import GraphTask, solve
 from .sense_process import sense
 from .wire import Group, Order
