@@ -60,9 +60,9 @@ def rays(px: Float, camera: CameraModel) -> Float:
 
 
 def project(points: Float, camera: CameraModel) -> Float:
-    """Ideal pixels (n, 2) of points (n, 3); NaN behind the camera."""
-    z = np.where(points[:, 2] > 1e-6, points[:, 2], np.nan)
-    return points[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    """Ideal pixels (..., 2) of points (..., 3); NaN behind the camera."""
+    z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
+    return points[..., :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def projection_jacobian(points: Float, camera: CameraModel) -> Float:
