@@ -41,7 +41,7 @@ def looked(stream: Stream, first_ns: int) -> Sample:
     pids = [os.getpid(), *stream.pids()]
     return Sample(
         (stream.stamp_ns() - first_ns) * 1e-9,
-        stream.counts.get("frames", 0),
+        stream.counts().get("frames", 0),
         tuple(cpu_s(pid) for pid in pids),
         tuple(rss_mb(pid) for pid in pids),
     )

@@ -12,7 +12,7 @@ from ..sensing import Sensed
 from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
-from .parent import end_with_parent
+from .parent import GRAPH_NICE, end_with_parent, give_way
 from .settings import StreamSettings
 from .wire import Died, Done, LateClick, Order, Ready
 
@@ -35,6 +35,7 @@ class GraphTask:
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     end_with_parent()
+    give_way(GRAPH_NICE)
     try:
         loop = _started(task, out, task.prior)
         out.put(Ready("graph"))
