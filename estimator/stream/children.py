@@ -35,13 +35,11 @@ class Children:
     """Tracking, the other front ends and the graph, each in a process of its own. They end with their parent.
 
     Args:
-        patient: the sources wait: nothing may be left out.
         heard: takes what they say, from a thread for each of them.
     """
 
-    def __init__(self, task: GraphTask, patient: bool, heard: Heard) -> None:
+    def __init__(self, task: GraphTask, heard: Heard) -> None:
         self._task = task
-        self._patient = patient
         self._heard = heard
         self._context = multiprocessing.get_context("spawn")
         self._processes: list[BaseProcess] = []
@@ -61,8 +59,8 @@ class Children:
         self._to_graph = context.Queue(settings.graph_ahead)
         task, rig = replace(self._task, prior=prior), self._task.rig
         work = (
-            (track, (rig, self._patient, self._to_track, self._to_look)),
-            (look, (rig, settings, self._to_look, self._to_graph)),
+            (track, (rig, task.patient, self._to_track, self._to_look)),
+            (look, (rig, settings, task.patient, self._to_look, self._to_graph)),
             (solve, (task, self._to_graph)),
         )
         self._processes = []

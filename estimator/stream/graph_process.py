@@ -30,12 +30,15 @@ class GraphTask:
     """A checkpoint to begin with."""
     checkpoint: Path | None
     validated: ValidatedRange | None
+    patient: bool = False
+    """The sources wait, so that no pose is late."""
 
 
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     end_with_parent()
-    give_way(GRAPH_NICE)
+    if not task.patient:
+        give_way(GRAPH_NICE)
     try:
         loop = _started(task, out, task.prior)
         out.put(Ready("graph"))

@@ -26,10 +26,15 @@ REFUSALS = 1000
 """Refused measurements that are kept with their words."""
 
 
-def look(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) -> None:
-    """The process. `inbox`, `graph` and `out` are queues between processes."""
+def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: Any, out: Any) -> None:
+    """The process. `inbox`, `graph` and `out` are queues between processes.
+
+    Args:
+        patient: the sources wait, so that no pose is late.
+    """
     end_with_parent()
-    give_way(LOOK_NICE)
+    if not patient:
+        give_way(LOOK_NICE)
     cv2.setNumThreads(1)
     try:
         loop = LookLoop(rig, settings, graph, out)

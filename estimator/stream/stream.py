@@ -78,8 +78,8 @@ class Stream:
         self._patient = any(source.patient for source in sources)
         self._checkpoint = checkpoint
         self._begin = checkpoint if checkpoint is not None and checkpoint.exists() else prior
-        task = GraphTask(rig, settings, self._begin, checkpoint, validated)
-        self._children = Children(task, self._patient, self._hear)
+        task = GraphTask(rig, settings, self._begin, checkpoint, validated, self._patient)
+        self._children = Children(task, self._hear)
         self._queue: BoundedQueue[Arrival] = BoundedQueue(settings.queue_count, settings.queue_bytes)
         self._orders: deque[Order] = deque()
         self._order = LiveOrder(rig, settings.window_ns)
