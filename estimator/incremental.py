@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, gaussian_of, marginal
+from .marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -39,10 +39,6 @@ of a batch solution; `settle` makes up for what is left at the end."""
 
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
-
-SETTLE_ROUNDS = 2
-"""Relinearisations before variables leave: what they say is frozen where it is taken."""
-
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
@@ -121,7 +117,13 @@ class Incremental:
     def _drop(self, landmark: int) -> None:
         """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
         self.dropped.append(landmark)
-        self.log.off.update(i for i, factor, _ in self.log.active() if landmark in factor.keys())
+        for index, factor, record in [row for row in self.log.active() if landmark in row[1].keys()]:
+            prior = joint_of(factor, self._values) if record.family == FAMILY else None
+            rest = None if prior is None else without(prior, {landmark})
+            if rest is None:
+                self.log.off.add(index)
+            else:  # what is known of everything else does not go with it
+                self.log.replace(index, rest.factor())
         self._values.erase(landmark)
 
     def _rebuild(self) -> None:
@@ -160,8 +162,7 @@ class Incremental:
         Raises:
             ObservabilityError: a variable that leaves is not determined.
         """
-        self.settle(SETTLE_ROUNDS)
-        values = gtsam.Values(self._values)
+        values = self._stepped()
         past = {key: keys.landmark_before(keys.index(key)) for key in cut.split}
         for key, before in past.items():
             values.insert(before, values.atPoint3(key))
@@ -170,9 +171,12 @@ class Incremental:
         log = FactorLog()
         for _, factor, record in self.log.active():
             involved = set(factor.keys())
-            if involved & cut.dropped:
+            if record.family == FAMILY:
+                left = without(joint_of(factor, values), cut.dropped)
+                absorbed += [] if left is None else [renamed(left, past).factor()]
+            elif involved & cut.dropped:
                 continue
-            if involved & cut.leaving or record.family == FAMILY:
+            elif involved & cut.leaving:
                 torn = [past.get(key, key) for key in factor.keys()]
                 absorbed.append(factor.rekey(torn) if involved & cut.split else factor)
             else:
@@ -188,6 +192,17 @@ class Incremental:
         self.log = log
         self._begin(values)
         return gtsam.Values(self._values)
+
+    def _stepped(self) -> gtsam.Values:
+        """The estimate one full Newton step on: what leaves is frozen where it is taken. iSAM2 would need several times
+        as long for it, and is begun anew afterwards."""
+        graph = self.log.graph()
+        try:
+            with determined():
+                return self._values.retract(graph.linearize(self._values).optimize())
+        except Undetermined:
+            self._restart()
+            return gtsam.Values(self._values)
 
     def _begin(self, values: gtsam.Values) -> None:
         """iSAM2 anew on all factors, linearised at `values`."""
