@@ -11,6 +11,7 @@ from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
 from ..io.ordering import OrderReport
 from ..io.reader import LogReader
+from .depth_run import depth_alone, depth_result
 from .pipeline import Pipeline
 from .result import Result
 from .run import finish
@@ -63,26 +64,37 @@ def optimise(
                 if progress is not None:
                     progress(stamp_ns)
             report = recording.report
-            pipeline.check(report.sensing)
+            provenance = _provenance(log, rig, report.sha256, command)
+            alone = depth_alone(pipeline.engine, report.sensing)
+            if not alone:
+                pipeline.check(report.sensing)
+        odd = [
+            *_damage(report.warnings, pipeline.engine.end_ns),
+            *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
+        ]
+        if alone:
+            return depth_result(log, rig, watch.seconds, provenance, odd)
         with watch("refine"):
             return finish(
                 pipeline.engine,
                 between,
                 watch.seconds,
-                {
-                    "surecut": version("surecut"),
-                    "gtsam": version("gtsam"),
-                    "log": log.name,
-                    "log_sha256": report.sha256,
-                    "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
-                    "command": command,
-                },
+                provenance,
                 report.sensing.rejected,
-                [
-                    *_damage(report.warnings, pipeline.engine.end_ns),
-                    *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
-                ],
+                odd,
             )
+
+
+def _provenance(log: Path, rig: Rig, sha256: str, command: str) -> dict[str, str]:
+    """What made the result, of what."""
+    return {
+        "surecut": version("surecut"),
+        "gtsam": version("gtsam"),
+        "log": log.name,
+        "log_sha256": sha256,
+        "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
+        "command": command,
+    }
 
 
 @contextmanager
