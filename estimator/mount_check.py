@@ -32,8 +32,8 @@ Float = NDArray[np.float64]
 CELL_RAD = np.deg2rad(15.0)
 """Part of the view over which a depth camera's smooth distortion counts as one error."""
 SAME_PIPE_SIGMA = 4.0
-WEAK_SIGMA = 0.3
-"""Sigma of {b} (rad, or m at 1 m) beyond which the cloud tells nothing about a mount."""
+LOOSE_SIGMAS = 3.0
+"""Along a direction that the cloud holds worse than so many sigmas of the tape it tells nothing about a mount."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,8 @@ class MountTest:
     board: str
     sigma: float
     """The disagreement, as the deviate of a normal variable that is as improbable."""
+    directions: int
+    """Of six that the cloud holds; the others, such as along a bare wall, are left out of all of these numbers."""
     shift_m: float
     turn_rad: float
     shift_sigma_m: float
@@ -59,9 +61,10 @@ class MountTest:
         """What a user has to know; None where both ways agree."""
         if self.sigma < TOLD_SIGMA:
             return None
+        held = "" if self.directions == 6 else f", which holds {self.directions} of 6 directions,"
         on_it = f"{self.landmarks} landmarks" + (f" and {self.pipes} pipes" if self.pipes else "")
         text = (
-            f"mount: by {on_it} on the Kinect's cloud {{b}} stands {1e3 * self.shift_m:.0f} +/- "
+            f"mount: by {on_it} on the Kinect's cloud{held} {{b}} stands {1e3 * self.shift_m:.0f} +/- "
             f"{1e3 * self.shift_sigma_m:.0f} mm and {np.degrees(self.turn_rad):.1f} +/- "
             f"{np.degrees(self.turn_sigma_rad):.1f} degrees from the rig file's f_T_b of board {self.board} "
             f"({self.sigma:.1f} sigma); measure the mount again"
@@ -118,15 +121,53 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     linear = unit.linearize(solved)
     J, residual = linear.jacobian()
     spread = without.covariance([(k, J[:, 6 * i : 6 * i + 6]) for i, k in enumerate(linear.keys())])
-    if np.sqrt(np.diag(spread)).max() > WEAK_SIGMA:
+    own = np.array([mount.rotation_sigma_rad] * 3 + [mount.translation_sigma_m] * 3)
+    held = held_part(residual, spread, own)
+    if held is None:
         return None
-    own = np.diag([mount.rotation_sigma_rad**2] * 3 + [mount.translation_sigma_m**2] * 3)
-    total = float(residual @ np.linalg.solve(spread + own, residual))
-    size = [float(np.linalg.norm(residual[part])) for part in (slice(0, 3), slice(3, 6))]
-    noise = [float(np.sqrt(np.trace((spread + own)[part, part]))) for part in (slice(0, 3), slice(3, 6))]
+    size = [float(np.linalg.norm(held.residual[part])) for part in (slice(0, 3), slice(3, 6))]
+    noise = [float(np.sqrt(np.trace(held.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6))]
     return MountTest(
-        mount.board, deviate(total, 6), size[1], size[0], noise[1], noise[0], len(planes), len(pipes), cloud.stamp_ns
+        mount.board, deviate(held.total, held.directions), held.directions, size[1], size[0], noise[1], noise[0],
+        len(planes), len(pipes), cloud.stamp_ns,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class HeldPart:
+    """A disagreement along the directions that the looser one of two ways still holds."""
+
+    total: float
+    """Chi-square."""
+    directions: int
+    residual: Float
+    """Shape (6,)."""
+    covariance: Float
+    """Shape (6, 6), of rank `directions`."""
+
+
+def held_part(residual: Float, spread: Float, own_sigmas: Float) -> HeldPart | None:
+    """The part of a disagreement along which `spread` is not much larger than the other way's own noise.
+
+    In units of the own noise the directions are the eigenvectors of the spread; they do not depend on the residual, so
+    that the chi-square is one of that many degrees of freedom.
+
+    Args:
+        residual: shape (6,).
+        spread: shape (6, 6), covariance of one way.
+        own_sigmas: shape (6,), of the other.
+
+    Returns:
+        None where nothing is held.
+    """
+    values, vectors = np.linalg.eigh(spread / np.outer(own_sigmas, own_sigmas))
+    held = values < LOOSE_SIGMAS**2
+    if not held.any():
+        return None
+    basis, variance = vectors[:, held], 1.0 + values[held]
+    part = basis.T @ (residual / own_sigmas)
+    back = own_sigmas[:, None] * basis
+    return HeldPart(float((part**2 / variance).sum()), int(held.sum()), back @ part, (back * variance) @ back.T)
 
 
 def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
