@@ -71,7 +71,7 @@ class BaseSearch:
         if found is None or not found.plausible:
             return False
         what = f"{found.on_surface} landmarks on the Kinect's surfaces, {found.contradictions} before them"
-        engine.place_base(pose3(found.o_T_b), view.cloud.stamp_ns, what)
+        engine.machine.enter_by_surfaces(pose3(found.o_T_b), view.cloud.stamp_ns, what)
         return True
 
     def _on_surfaces(self, guess: Float, view: DepthView) -> PointRegistration | None:

@@ -17,6 +17,7 @@ from .incremental import Cut
 from .linearised import linearise
 from .marginal import FAMILY
 from .observability import Undetermined
+from .refusals import lists_of_rejections
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +144,7 @@ class Bounded:
     def _shorten(self) -> None:
         """Lists that only tell keep their newest entries."""
         engine, most = self.engine, self.limits.told
-        for told in engine.lists_of_rejections():
+        for told in lists_of_rejections(engine):
             self.refused.update(r.family for r in told[:-most])
             del told[:-most]
         del engine.events[:-most]

@@ -152,7 +152,7 @@ class GraphLoop:
     def _maybe_audit(self, stamp_ns: int) -> None:
         if stamp_ns < self._next_audit_ns and self._next_audit_ns - stamp_ns <= self._settings.audit_period_ns:
             return
-        if self.engine.odometry.last_keyframe < 0 or self.engine.unsolved():
+        if self.engine.odometry.last_keyframe < 0 or self.engine.graph.unsolved:
             return
         self._next_audit_ns = stamp_ns + self._settings.audit_period_ns
         if self.engine.boards.any_known():
