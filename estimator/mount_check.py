@@ -32,8 +32,8 @@ Float = NDArray[np.float64]
 CELL_RAD = np.deg2rad(15.0)
 """Part of the view over which a depth camera's smooth distortion counts as one error."""
 SAME_PIPE_SIGMA = 4.0
-LOOSE_SIGMAS = 3.0
-"""Along a direction that the cloud holds worse than so many sigmas of the tape it tells nothing about a mount."""
+WEAK_SIGMA = 0.3
+"""Sigma of {b} (rad, or m) beyond which the cloud tells nothing about a mount in that direction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     linear = unit.linearize(solved)
     J, residual = linear.jacobian()
     spread = without.covariance([(k, J[:, 6 * i : 6 * i + 6]) for i, k in enumerate(linear.keys())])
-    own = np.array([mount.rotation_sigma_rad] * 3 + [mount.translation_sigma_m] * 3)
+    own = np.diag([mount.rotation_sigma_rad**2] * 3 + [mount.translation_sigma_m**2] * 3)
     held = held_part(residual, spread, own)
     if held is None:
         return None
@@ -146,28 +146,27 @@ class HeldPart:
     """Shape (6, 6), of rank `directions`."""
 
 
-def held_part(residual: Float, spread: Float, own_sigmas: Float) -> HeldPart | None:
-    """The part of a disagreement along which `spread` is not much larger than the other way's own noise.
+def held_part(residual: Float, spread: Float, own: Float) -> HeldPart | None:
+    """The part of a disagreement along the directions that `spread` leaves surer than `WEAK_SIGMA`.
 
-    In units of the own noise the directions are the eigenvectors of the spread; they do not depend on the residual, so
-    that the chi-square is one of that many degrees of freedom.
+    They are eigenvectors of the spread and do not depend on the residual, so that the chi-square is one of that many
+    degrees of freedom.
 
     Args:
-        residual: shape (6,).
-        spread: shape (6, 6), covariance of one way.
-        own_sigmas: shape (6,), of the other.
+        residual: shape (6,), rotation first.
+        spread: shape (6, 6), covariance of the way that may leave directions loose.
+        own: shape (6, 6), covariance of the other.
 
     Returns:
         None where nothing is held.
     """
-    values, vectors = np.linalg.eigh(spread / np.outer(own_sigmas, own_sigmas))
-    held = values < LOOSE_SIGMAS**2
-    if not held.any():
+    values, vectors = np.linalg.eigh(spread)
+    basis = vectors[:, values < WEAK_SIGMA**2]
+    if basis.shape[1] == 0:
         return None
-    basis, variance = vectors[:, held], 1.0 + values[held]
-    part = basis.T @ (residual / own_sigmas)
-    back = own_sigmas[:, None] * basis
-    return HeldPart(float((part**2 / variance).sum()), int(held.sum()), back @ part, (back * variance) @ back.T)
+    part, covariance = basis.T @ residual, basis.T @ (spread + own) @ basis
+    total = float(part @ np.linalg.solve(covariance, part))
+    return HeldPart(total, basis.shape[1], basis @ part, basis @ covariance @ basis.T)
 
 
 def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
