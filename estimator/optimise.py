@@ -55,7 +55,8 @@ def optimise(
     with LogReader(log) as reader:
         rig = rig_of(reader, rig_file)
     with opened(log, rig, processes) as recording, told_of(log, recording):
-        from .pipeline import Pipeline  # the graph's libraries are loaded while the front ends start
+        from .depth_run import depth_alone, depth_result  # the graph's libraries load while the front ends start
+        from .pipeline import Pipeline
         from .run import finish
 
         pipeline = Pipeline(rig)
@@ -64,26 +65,37 @@ def optimise(
                 if progress is not None:
                     progress(stamp_ns)
             report = recording.report
-            pipeline.check(report.sensing)
+            provenance = _provenance(log, rig, report.sha256, command)
+            alone = depth_alone(pipeline.engine, report.sensing)
+            if not alone:
+                pipeline.check(report.sensing)
+        odd = [
+            *_damage(report.warnings, pipeline.engine.end_ns),
+            *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
+        ]
+        if alone:
+            return depth_result(log, rig, watch.seconds, provenance, odd)
         with watch("refine"):
             return finish(
                 pipeline.engine,
                 between,
                 watch.seconds,
-                {
-                    "surecut": version("surecut"),
-                    "gtsam": version("gtsam"),
-                    "log": log.name,
-                    "log_sha256": report.sha256,
-                    "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
-                    "command": command,
-                },
+                provenance,
                 report.sensing.rejected,
-                [
-                    *_damage(report.warnings, pipeline.engine.end_ns),
-                    *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
-                ],
+                odd,
             )
+
+
+def _provenance(log: Path, rig: Rig, sha256: str, command: str) -> dict[str, str]:
+    """What made the result, of what."""
+    return {
+        "surecut": version("surecut"),
+        "gtsam": version("gtsam"),
+        "log": log.name,
+        "log_sha256": sha256,
+        "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
+        "command": command,
+    }
 
 
 @contextmanager
