@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
+from .marginal import FAMILY, GaussianPrior, gaussian_of, joint_of, marginal, renamed, without
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -235,14 +235,40 @@ class Incremental:
                 break
         return gtsam.Values(self._values)
 
-    def joint_covariance(self, keys: Sequence[int]) -> Float:
-        """Joint covariance of some variables, in the order of `keys`."""
-        joint = gaussian_of(self.log.graph(), self._values, keys)
-        covariance = np.linalg.inv(joint.H)
+    def joint_covariance(self, wanted: Sequence[int]) -> Float:
+        """Joint covariance of some variables, in the order of `wanted`.
+
+        Raises:
+            ObservabilityError: one of them is not determined, or another variable that is no landmark's.
+        """
+        joint = self._joint_of(wanted)
+        try:
+            covariance = np.linalg.inv(joint.H)
+        except np.linalg.LinAlgError as error:
+            weakest = int(np.abs(np.linalg.eigh(joint.H)[1][:, 0]).argmax())
+            raise Undetermined(int(np.repeat(joint.keys, joint.widths)[weakest])) from error
         ends = np.cumsum(joint.widths)
         columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
-        chosen = np.concatenate([columns[key] for key in keys])
+        chosen = np.concatenate([columns[key] for key in wanted])
         return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
+
+    def _joint_of(self, wanted: Sequence[int]) -> GaussianPrior:
+        """Landmarks that nothing determines at this linearisation say nothing: they are passed over."""
+        graph = self.log.graph()
+        for _ in range(MOST_DROPPED):
+            try:
+                with determined():
+                    return gaussian_of(graph, self._values, wanted)
+            except Undetermined as error:
+                if keys.kind(error.key) != "l" or error.key in wanted:
+                    raise
+                lost, rest = error.key, gtsam.NonlinearFactorGraph()
+                for factor in (graph.at(i) for i in range(graph.size())):
+                    if lost not in factor.keys():
+                        rest.add(factor)
+                graph = rest
+        with determined():
+            return gaussian_of(graph, self._values, wanted)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:
