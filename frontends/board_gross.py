@@ -128,7 +128,8 @@ def _sharpened(
     statistics, IJCV 19 (1996) 57.
     """
     least = float(np.sqrt(chi2_isf(FALSE_ALARM, 2)))
-    norms = _norms(corners, fit_board(corners, camera, pose, side_m))
+    fit = fit_board(corners, camera, pose, side_m)
+    norms, limit = _norms(corners, fit), least
     scale = float(norms.max(initial=0.0))
     while np.isfinite(scale) and scale > least:
         weights = (scale**2 / (scale**2 + norms**2)) ** 2
