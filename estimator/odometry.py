@@ -78,6 +78,8 @@ class Odometry:
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
+        self.adrift = False
+        """A motion prior has bridged a gap, and nobody has looked yet whether something else holds the camera again."""
         self._reference = -1
         """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
         self.joint_covariance: Callable[[Sequence[int]], Float] | None = None
@@ -271,6 +273,7 @@ class Odometry:
 
     def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
+        self.adrift = True
         earlier = keys.keyframe(self._reference)
         seconds = (frame.stamp_ns - self.keyframe_stamps[self._reference]) * 1e-9
         motion = self._state.pose(earlier).between(pose)
