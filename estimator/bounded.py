@@ -17,6 +17,7 @@ from .incremental import Cut
 from .linearised import linearise
 from .marginal import FAMILY
 from .observability import Undetermined
+from .refusals import lists_of_rejections
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +26,8 @@ class Limits:
 
     keyframes: int = 80
     """Keyframes in the graph, at most; a recording of half a minute makes about 60."""
-    step: int = 20
-    """Keyframes that leave together."""
+    step: int = 30
+    """Keyframes that leave together: the more, the more rarely the solver begins anew."""
     map_landmarks: int = 60
     """Landmarks of keyframes that left which stay, so that places that are seen again hold the camera."""
     shared_landmarks: int = 40
@@ -143,7 +144,7 @@ class Bounded:
     def _shorten(self) -> None:
         """Lists that only tell keep their newest entries."""
         engine, most = self.engine, self.limits.told
-        for told in engine.lists_of_rejections():
+        for told in lists_of_rejections(engine):
             self.refused.update(r.family for r in told[:-most])
             del told[:-most]
         del engine.events[:-most]

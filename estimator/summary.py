@@ -8,15 +8,6 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.board import mean_point
-from ..factors.calibration import (
-    depth_ray_sigmas,
-    depth_sigmas,
-    intrinsics_covariance,
-    left_T_right,
-    rgb_mean,
-    rgb_sigmas,
-    stereo_sigmas,
-)
 from ..factors.errors import ObservabilityError
 from ..factors.geometry import ros_covariance
 from ..factors.measurements import Event
@@ -25,18 +16,19 @@ from . import dark_uncertainty
 from .advice import advise
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
-from .calibration_states import depth_focal_px
+from .calibration_rows import calibration_rows
 from .consistency import family_tests, judge, prior_tests
-from .engine import Engine, distance_name
+from .engine import Engine
+from .known_distances import distance_name
 from .leave_out import without_families
 from .marker_points import parse_point
 from .motions import motions
 from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
 from .points_in_base import pipe_estimate, point_blocks, radius95
+from .refusals import everything_rejected
 from .result import (
     Advice,
-    CalibrationEstimate,
     Consistency,
     DistanceEstimate,
     PipeEstimate,
@@ -47,9 +39,6 @@ from .result import (
 from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
 
 Float = NDArray[np.float64]
-INTRINSICS = ("fx", "fy", None, "cx", "cy", "k1", "k2", "p1", "p2")
-"""Names of the intrinsics' components; the skew is not reported."""
-
 LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "picks")
 """Families without each of which there may still be an estimate to compare with."""
 
@@ -79,10 +68,10 @@ class Summary:
             poses=self._poses(),
             trajectory=self._trajectory(),
             pipes=pipes,
-            calibration=self._calibration(),
+            calibration=calibration_rows(engine, self._values, self._sigmas),
             distances=distances,
             consistency=consistency,
-            rejected=(*engine.everything_rejected(), *self._solution.rejected),
+            rejected=(*everything_rejected(engine), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
             streaming_difference_sigma=self._streaming_difference(),
             timing=timing,
@@ -226,104 +215,10 @@ class Summary:
         count = self._engine.odometry.last_keyframe + 1
         return self._system.marginals([keys.keyframe(i) for i in range(count)])
 
-    # Calibration and distances --------------------------------------------------------------------------------
-
-    def _calibration(self) -> tuple[CalibrationEstimate, ...]:
-        rows: list[CalibrationEstimate] = []
-        engine, rig = self._engine, self._engine.rig
-        for camera in keys.CAMERA_INDEX:
-            if self._values.exists(keys.intrinsics(camera)):
-                model, settings = engine.cameras[camera], getattr(rig.cameras, camera)
-                prior = np.sqrt(np.diag(intrinsics_covariance(model, settings)))
-                mean = np.array([model.fx, model.fy, 0.0, model.cx, model.cy, 0.0, 0.0, 0.0, 0.0])
-                value = self._values.atCal3DS2(keys.intrinsics(camera)).vector()
-                sigma = self._sigmas(keys.intrinsics(camera))
-                frozen = ["focal" in settings.freeze] * 2 + [True] + ["centre" in settings.freeze] * 2
-                frozen += ["distortion" in settings.freeze] * 4
-                for i, part in enumerate(INTRINSICS):
-                    if part is None:
-                        continue
-                    rows.append(
-                        CalibrationEstimate(
-                            f"{camera}.{part}", "px" if i < 5 else "1", value[i], sigma[i], mean[i], prior[i], frozen[i]
-                        )
-                    )
-        rows += self._extrinsic_rows()
-        if self._values.exists(keys.DEPTH):
-            value, sigma, prior = self._values.atVector(keys.DEPTH), self._sigmas(keys.DEPTH), depth_sigmas(rig.kinect)
-            freeze = rig.kinect.freeze
-            rows.append(
-                CalibrationEstimate("depth_offset", "m", value[0], sigma[0], 0.0, prior[0], "depth_offset" in freeze)
-            )
-            rows.append(
-                CalibrationEstimate("depth_scale", "1", value[1], sigma[1], 0.0, prior[1], "depth_scale" in freeze)
-            )
-            value, sigma = self._values.atVector(keys.DEPTH_RAYS), self._sigmas(keys.DEPTH_RAYS)
-            camera, model = rig.cameras.b_depth, engine.cameras.get("b_depth")
-            prior = depth_ray_sigmas(camera, depth_focal_px(model))
-            names = (("x", "centre"), ("y", "centre"), ("scale", "focal"))
-            for i, (part, settled) in enumerate(names):
-                rows.append(
-                    CalibrationEstimate(
-                        f"depth_ray_{part}", "1" if i == 2 else "rad", value[i], sigma[i], 0.0, prior[i],
-                        settled in camera.freeze,
-                    )
-                )  # fmt: skip
-        for board in rig.boards:
-            page = keys.page(engine.boards.index(board.id))
-            if self._values.exists(page):
-                value, sigma = self._values.atVector(page), self._sigmas(page)
-                rows.append(
-                    CalibrationEstimate(
-                        f"{board.id}.side", "m", value[0], sigma[0], board.side_m, board.side_sigma_m, False
-                    )
-                )
-                rows.append(
-                    CalibrationEstimate(
-                        f"{board.id}.print_scale", "1", value[1], sigma[1], 1.0, board.print_scale_sigma, False
-                    )
-                )
-        rows += engine.boards.insets
-        return tuple(rows)
-
-    def _extrinsic_rows(self) -> list[CalibrationEstimate]:
-        rig, rows = self._engine.rig, []
-        named = []
-        if self._values.exists(keys.extrinsics("m_right")):
-            mean = left_T_right(self._engine.cameras["m_left"], self._engine.cameras["m_right"], rig.stereo)
-            spread = np.sqrt(np.diag(stereo_sigmas(mean, rig.stereo)))
-            named.append(("m_left_T_m_right", keys.extrinsics("m_right"), mean, spread, rig.stereo.freeze))
-        if self._values.exists(keys.extrinsics("b_rgb")):
-            named.append(
-                (
-                    "b_T_rgb",
-                    keys.extrinsics("b_rgb"),
-                    rgb_mean(rig.kinect),
-                    rgb_sigmas(rig.kinect),
-                    "b_T_rgb" in rig.kinect.freeze,
-                )
-            )
-        for name, key, mean, spread, frozen in named:
-            moved = gtsam.Pose3.Logmap(mean.between(self._values.atPose3(key)))
-            sigma = self._sigmas(key)
-            for i, part in enumerate(("rx", "ry", "rz")):
-                rows.append(CalibrationEstimate(f"{name}.{part}", "rad", moved[i], sigma[i], 0.0, spread[i], frozen))
-            nominal = mean.rotation().matrix().T @ mean.translation()
-            for i, part in enumerate(("tx", "ty", "tz")):
-                rows.append(
-                    CalibrationEstimate(
-                        f"{name}.{part}",
-                        "m",
-                        nominal[i] + moved[3 + i],
-                        sigma[3 + i],
-                        nominal[i],
-                        spread[3 + i],
-                        frozen,
-                    )
-                )
-        return rows
+    # Distances ------------------------------------------------------------------------------------------------
 
     def _sigmas(self, key: int) -> Float:
+        """Standard deviations of one variable's components."""
         return np.sqrt(np.clip(np.diag(self._system.joint([key])), 0.0, None))
 
     def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
@@ -352,7 +247,7 @@ class Summary:
         return variance
 
     def _distance(self, a: str, b: str) -> tuple[float, float] | None:
-        points = [self._engine.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]
+        points = [self._engine.distances.point_keys(parse_point(text, self._engine.rig)) for text in (a, b)]
         if points[0] is None or points[1] is None:
             return None
         difference = mean_point(self._values, points[0]) - mean_point(self._values, points[1])

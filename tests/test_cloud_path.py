@@ -184,7 +184,7 @@ def test_without_a_board_the_cloud_alone_holds_the_point_in_its_region(run):
     placed = register_points(landmark_map(engine).points, engine.surfaces.cloud, guess, DEPTH_SIGMAS)
     assert placed is not None
     assert placed.plausible
-    engine.place_base(pose3(placed.o_T_b), 0, "a guess")
+    engine.machine.enter_by_surfaces(pose3(placed.o_T_b), 0, "a guess")
     result = finish(engine)
     assert [event.kind for event in result.events if event.kind == "base_by_cloud"]
     for point in result.points:

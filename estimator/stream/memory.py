@@ -58,7 +58,7 @@ class Memory:
 def remember(engine: Engine) -> Memory | None:
     """What an engine knows now; None while it knows no board."""
     values = engine.state.values
-    if not engine.boards.any_known() or engine.unsolved():
+    if not engine.boards.any_known() or engine.graph.unsolved:
         return None
     return Memory(
         stamp_ns=engine.end_ns,
@@ -97,8 +97,8 @@ def remember(engine: Engine) -> Memory | None:
             for name, c in engine.pipes.cylinders.items()
             if c.known
         ],
-        mounted=engine.mounted,
-        distances_open=[engine.rig.distances.index(d) for d in engine.distances_open],
+        mounted=engine.machine.mounted,
+        distances_open=[engine.rig.distances.index(d) for d in engine.distances.open],
         inset_sigma_px=[(*key, sigma) for key, sigma in engine.boards.corners.inset_sigma_px.items()],
         cylinders=sorted(_seen_by_machine(engine)),
     )

@@ -1,0 +1,33 @@
+"""The graph while it grows: what is believed, what waits for the solver, and the solver."""
+
+from .graph import State, Update
+from .incremental import Incremental
+
+
+class OpenGraph:
+    """New factors wait here for the next iSAM2 update; their first guesses count from now on."""
+
+    def __init__(self) -> None:
+        self.state = State()
+        self.solver = Incremental()
+        self._pending = Update()
+
+    @property
+    def unsolved(self) -> bool:
+        """Are there factors that have not been through the solver?"""
+        return not self._pending.empty()
+
+    def take(self, update: Update) -> None:
+        """Takes new factors and guesses."""
+        if update.empty():
+            return
+        self.state.values.insert(update.values)
+        self._pending.extend(update)
+
+    def flush(self) -> bool:
+        """One iSAM2 update with what has gathered; False where there was nothing."""
+        if self._pending.empty():
+            return False
+        update, self._pending = self._pending, Update()
+        self.state.values = self.solver.update(update)
+        return True
