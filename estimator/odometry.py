@@ -18,6 +18,10 @@ from .track_gate import FAMILY, Gate, Newest, TrackGate, residuals
 Float = NDArray[np.float64]
 
 
+POOR_S = 0.1
+"""How long before they break tracks may have been wrong."""
+
+
 @dataclass(frozen=True, slots=True)
 class OdometrySettings:
     """How many tracks enter, and what counts as a landmark."""
@@ -60,6 +64,10 @@ class Odometry:
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
+        self._held_ns = 0
+        """The last frame that the tracks held."""
+        self.gap_s = 0.0
+        """Time that the newest keyframe's motion prior alone bridges to those before; zero where landmarks do."""
         self._reference = -1
         """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
         self.gate = TrackGate(state, settings.gate)
@@ -69,8 +77,19 @@ class Odometry:
         """Index of the newest keyframe, -1 before the first."""
         return len(self.keyframe_stamps) - 1
 
+    @property
+    def lost_speed_m_s(self) -> float:
+        """Standard deviation of the velocity while nothing is tracked."""
+        return self._settings.lost_speed_m_s
+
+    def expected(self) -> gtsam.Pose3:
+        """Where the frame just followed stands, by its motion since the last keyframe."""
+        return self._guess_pose(len(self.keyframe_stamps))
+
     def follow(self, frame: StereoFrame) -> None:
         """Moves the camera by the front end's estimate; every frame passes here once, in order."""
+        if not frame.lost:
+            self._held_ns = frame.stamp_ns
         if self.keyframe_stamps:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
@@ -88,14 +107,16 @@ class Odometry:
         key = keys.keyframe(index)
         update.guess(key, pose)
         rejected: list[Rejection] = []
+        self.gap_s = 0.0
         known, new = self._split(frame)
         if index == 0:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
             known, rejected = self.gate.gated(frame, known, pose, self._newest())
             connected = self._state.has(keys.keyframe(self._reference))
-            if connected and (self._since_keyframe_lost or len(known) < self._settings.minimum_shared):
-                self._bridge(update, index, frame, pose)
+            few = len(known) < self._settings.minimum_shared
+            if connected and (self._since_keyframe_lost or few):
+                self._bridge(update, index, frame, pose, few)
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self._create(update, frame, new, index, pose)
@@ -163,10 +184,14 @@ class Odometry:
                 new.append(row)
         return known, new
 
-    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
+    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3, few: bool) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
         earlier = keys.keyframe(self._reference)
         seconds = (frame.stamp_ns - self.keyframe_stamps[self._reference]) * 1e-9
+        if self._since_keyframe_lost:
+            # Up to the loss the front end has followed the motion; a frame or two more may have been poor already.
+            seconds = min(seconds, (frame.stamp_ns - self._held_ns) * 1e-9 + POOR_S)
+            self.gap_s = seconds if few else 0.0
         motion = self._state.pose(earlier).between(pose)
         factor = motion_prior(
             earlier,
