@@ -17,7 +17,8 @@ from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
 from .executor import single_threaded_children
-from .sensing import Sensed, Sensing, SensingReport, wanted_topics
+from .items import wanted_topics
+from .sensing import Sensed, Sensing, SensingReport
 
 AHEAD = 64
 """Stamps that the front ends may be ahead of the graph: what bounds the memory."""

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
 from surecut.estimator.pipeline import Pipeline
 from surecut.estimator.points_in_base import point_blocks
-from surecut.estimator.sensing import Sensing, wanted_topics
+from surecut.estimator.sensing import Sensing
 from surecut.estimator.stream.memory import MemoryFileError, from_json, load
 from surecut.factors import keys
 from surecut.io.reader import LogReader

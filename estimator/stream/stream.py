@@ -16,18 +16,17 @@ from ...io.live.bounded import BoundedQueue, is_urgent, message_size
 from ...io.live.interfaces import Clock, Command, Freeze, LiveImage, Pick, Reply, Reset, Save, Sink, Source
 from ...io.live.tally import Tally
 from ...io.messages import ImageBody, Message, PickBody
-from ..sensing import Item, plain
+from ..items import Item, plain
 from ..validated_range import ValidatedRange
 from .arrivals import Arrivals
 from .children import NAMES, Children
 from .follower import Followed
-from .graph_process import GraphTask
 from .latency import Latencies
 from .ordering import LiveOrder
 from .publisher import update_of
 from .settings import StreamSettings
 from .situation import Situation
-from .wire import Answer, Died, Done, Frame, Group, Order, Ready, Worked
+from .wire import Answer, Died, Done, Frame, GraphTask, Group, Order, Ready, Worked
 
 TICK_S = 0.003
 SWITCH_S = 0.0005
