@@ -49,6 +49,8 @@ class SensingReport:
     pairing: PairingReport = field(default_factory=PairingReport)
     rejected: tuple[Rejection, ...] = ()
     """What the front ends themselves refused."""
+    depths: int = 0
+    """Depth images and clouds."""
 
 
 class Sensing:
@@ -65,6 +67,7 @@ class Sensing:
         """Cameras whose calibration has been handed on."""
         self._started = False
         """The first pair is a keyframe whatever it shows."""
+        self._depths_seen = 0
         self._last_colour_ns: int | None = None
         self._colour: ImageBody | None = None
         """The Kinect's newest colour image, not decoded."""
@@ -146,7 +149,7 @@ class Sensing:
 
     def report(self) -> SensingReport:
         """What was odd, and what was refused, so far."""
-        return SensingReport(self._order, self._pairing, tuple(self.sensors.rejected))
+        return SensingReport(self._order, self._pairing, tuple(self.sensors.rejected), self._depths_seen)
 
     def calibrate(self, group: list[Item]) -> None:
         """Calibrations among the messages open their cameras."""
@@ -197,8 +200,10 @@ class Sensing:
                 continue
             if isinstance(item.body, DepthBody) and item.topic == self.rig.cameras.b_depth.image_topic:
                 view = self.sensors.depth(stamp_ns, item.body.depth_m()) or view
+                self._depths_seen += 1
             if isinstance(item.body, CloudBody) and item.topic == self.rig.kinect.points_topic:
                 view = kinect.cloud(stamp_ns, item.body.points_m()) if kinect.cloud_due(stamp_ns) else view
+                self._depths_seen += 1
         if view is None or self._colour is None:
             return view
         return replace(view, colour=grey(self._colour.pixels()))

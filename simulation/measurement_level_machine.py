@@ -168,6 +168,7 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
         feet[i] = pick_px - (line @ np.r_[pick_px, 1.0]) * line[:2]
         spread = np.array([np.hypot(sigmas[0], EDGE_FLOOR_PX), sigmas[1]])
         shift, turn = rng.normal(0.0, spread * world.scenario.noise_factors.outlines)
+        shift += world.insets_px[i]
         if "outlines" in world.scenario.outliers.families and rng.random() < world.scenario.outliers.share:
             shift += rng.uniform(-1.0, 1.0) * world.scenario.outliers.size_px
         noisy[i] = _moved_line(line, feet[i], shift, turn)

@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from ..executor import single_threaded_children
+from ..threads import single_threaded_children
 from .forking import context
 from .wire import GraphTask, Group, Order
 

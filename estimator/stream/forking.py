@@ -5,7 +5,7 @@ import multiprocessing
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext, SpawnContext
 
-from ..executor import single_threaded_children
+from ..threads import single_threaded_children, use_one_thread
 
 LOADED = ("track_process", "look_process", "graph_process")
 
@@ -24,6 +24,7 @@ def context() -> Context:
 
 def prepare() -> None:
     """Begins to load in the background; what the caller loads meanwhile costs no further time."""
+    use_one_thread()
     if _forks():
         context()
         with single_threaded_children():
