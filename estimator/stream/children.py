@@ -98,6 +98,8 @@ class Children:
 
     def backlog(self) -> int:
         """Stamps that wait for the graph."""
+        if self._to_graph is None:
+            return 0
         try:
             return self._to_graph.qsize()
         except NotImplementedError:  # macOS cannot tell

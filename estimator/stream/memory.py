@@ -24,7 +24,9 @@ from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
 from ..output_files import write_text
 from ..pipes import known_cylinder, known_point
+from .remembered import KEY, to_data
 from .variables import LONG_LIVED, long_lived
+from .wire import Answer
 
 Float = NDArray[np.float64]
 
@@ -148,9 +150,13 @@ def _seen_by_machine(engine: Engine) -> set[str]:
 # The file -------------------------------------------------------------------------------------------------------------
 
 
-def save(memory: Memory, path: Path, rig_sha256: str) -> None:
-    """Writes it whole or not at all: to a file beside it, then renamed."""
-    write_text(path, to_json(memory, rig_sha256))
+def save(memory: Memory, path: Path, rig_sha256: str, answer: Answer | None = None) -> None:
+    """Writes it whole or not at all: to a file beside it, then renamed.
+
+    Args:
+        answer: what was said last, see `remembered`.
+    """
+    write_text(path, to_json(memory, rig_sha256, answer))
 
 
 def load(path: Path) -> Memory:
@@ -165,7 +171,7 @@ def load(path: Path) -> Memory:
     return from_json(text, str(path))
 
 
-def to_json(memory: Memory, rig_sha256: str) -> str:
+def to_json(memory: Memory, rig_sha256: str, answer: Answer | None = None) -> str:
     prior = memory.prior
     body = {
         "surecut_memory": FORMAT,
@@ -186,6 +192,8 @@ def to_json(memory: Memory, rig_sha256: str) -> str:
         "inset_sigma_px": memory.inset_sigma_px,
         "cylinders": memory.cylinders,
     }
+    if answer is not None:
+        body[KEY] = to_data(answer)
     return json.dumps(body, allow_nan=False) + "\n"
 
 
