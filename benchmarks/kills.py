@@ -192,7 +192,8 @@ def main() -> None:
         max(getattr(k, n) for k in found) for n in ("back_s", "off_sigma", "lost_s", "wrong_sigma")
     )
     print(
-        f"{len(found)} kills: back after {back[len(back) // 2]:.1f} s (median), {slowest:.1f} s (slowest, limit {BACK_S}); "
+        f"{len(found)} kills: back after {back[len(back) // 2]:.1f} s (median), {slowest:.1f} s (slowest, limit "
+        f"{BACK_S}); "
         f"at most {off:.2f} sigma from the points before, {wrong:.1f} sigma from the truth, {most:.2f} s lost, "
         f"{sum(k.go for k in found)} times GO before a board was seen"
     )

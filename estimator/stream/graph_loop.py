@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
-from ...factors.rig import Rig
+from ...factors.rig import Rig, sha256_of
 from ..bounded import Bounded
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
@@ -23,7 +23,6 @@ from .audit import Audit, audit
 from .calibration import departures, held, hold
 from .memory import Memory, recall, remember, save
 from .posterior import Posterior, posterior_of
-from .remembered import sha256_of
 from .settings import S, StreamSettings
 from .trust import grown
 from .wire import Answer, Place

@@ -3,7 +3,6 @@
 It carries no verdict: points and machine stand where they stood, and whoever asks has to measure again before a cut.
 """
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...factors.rig import Rig, dump_rig
+from ...factors.rig import Rig, sha256_of
 from ..result import PointEstimate
 from .wire import Answer, Place
 
@@ -46,11 +45,6 @@ def to_data(answer: Answer) -> dict[str, Any]:
             for p in answer.points
         ],
     }
-
-
-def sha256_of(rig: Rig) -> str:
-    """Tells rigs apart."""
-    return hashlib.sha256(dump_rig(rig).encode()).hexdigest()
 
 
 def remembered(checkpoint: Path, rig: Rig) -> Answer | None:
