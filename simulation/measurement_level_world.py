@@ -30,6 +30,8 @@ class World:
     insets_px: Float
     """Shape (2,): how far outside of its two outlines' true places a pipe's edges are seen, in all views."""
     rng: np.random.Generator
+    outlier_rng: np.random.Generator
+    """Of its own, so that a run with outliers has the scene and noise of the one without."""
 
 
 def project(camera: TrueCamera, w_T_camera: Float, points_w: Float) -> tuple[Float, Float]:
