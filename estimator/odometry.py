@@ -89,7 +89,7 @@ class Odometry:
 
     def follow(self, frame: StereoFrame) -> None:
         """Moves the camera by the front end's estimate; every frame passes here once, in order."""
-        if self.keyframe_stamps:
+        if self._reference >= 0:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
             self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last))
@@ -111,7 +111,7 @@ class Odometry:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
             known, rejected = self._gated(frame, known, pose)
-            connected = self._state.has(keys.keyframe(self._reference))
+            connected = self._reference >= 0 and self._state.has(keys.keyframe(self._reference))
             if connected and (self._since_keyframe_lost or len(known) < self._settings.minimum_shared):
                 self._bridge(update, index, frame, pose)
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
