@@ -121,13 +121,10 @@ def landmark_depth(factor: gtsam.NonlinearFactor, record: Record, values: gtsam.
 
 def orphans(at: Linearised, off: set[int]) -> list[tuple[int, Rejection]]:
     """What is left of landmarks that the removal of outliers left with one view: it determines no point."""
-    touching: dict[int, list[int]] = {}
-    for position, (_, factor, _) in enumerate(at.active):
-        for key in factor.keys():
-            if keys.kind(key) == "l":
-                touching.setdefault(key, []).append(position)
+    gone = [factor for index, factor, _ in at.active if index in off]
+    landmarks = sorted({key for factor in gone for key in factor.keys() if keys.kind(key) == "l"})
     found = []
-    for positions in touching.values():
+    for positions in at.system.touching(landmarks):
         left = [p for p in positions if at.active[p][0] not in off]
         views = sum(at.active[p][2].camera is not None for p in left)
         if len(left) == len(positions) or views >= MINIMUM_VIEWS:

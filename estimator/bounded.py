@@ -26,8 +26,8 @@ class Limits:
 
     keyframes: int = 80
     """Keyframes in the graph, at most; a recording of half a minute makes about 60."""
-    step: int = 20
-    """Keyframes that leave together."""
+    step: int = 30
+    """Keyframes that leave together: the more, the more rarely the solver begins anew."""
     map_landmarks: int = 60
     """Landmarks of keyframes that left which stay, so that places that are seen again hold the camera."""
     shared_landmarks: int = 40

@@ -8,7 +8,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, identity, vstack
+from scipy.sparse import csc_matrix, csr_matrix, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -90,6 +90,16 @@ class LinearSystem:
     @property
     def parameters(self) -> int:
         return self._columns
+
+    def touching(self, keys: Sequence[int]) -> list[list[int]]:
+        """Positions of the factors that each variable is in."""
+        by_column = csc_matrix(self.A)
+        found = []
+        for key in keys:
+            column = self.columns[key]
+            rows = by_column.indices[by_column.indptr[column.start] : by_column.indptr[column.stop]]
+            found.append(np.unique(np.searchsorted(self.starts, rows, side="right") - 1).tolist())
+        return found
 
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""

@@ -19,6 +19,8 @@ Float = NDArray[np.float64]
 
 FAMILY = "stereo odometry"
 
+VIEWS_PASSED = 3
+"""Views of a track without a landmark that are kept beside its newest one."""
 AWAY = 3
 """Keyframes without a view after which a landmark counts as having come back."""
 DRIFT_SAMPLE = 5
@@ -53,6 +55,10 @@ class FramePose:
     """Shape (4, 4)."""
 
 
+View = tuple[int, StereoFrame, int]
+"""Keyframe index, its frame, and a track's row in it."""
+
+
 class Odometry:
     """Turns stereo frames into keyframes and landmarks."""
 
@@ -60,7 +66,9 @@ class Odometry:
         self._state = state
         self._settings = settings
         self._robust_sigma = robust_sigma
-        self._waiting: dict[int, tuple[int, StereoFrame, int]] = {}
+        self._waiting: dict[int, View] = {}
+        self._passed: dict[int, list[View]] = {}
+        """Views of waiting tracks before the one that waits, the newest first: they did not agree with the next one."""
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
         self.seen_in: dict[int, int] = {}
@@ -122,6 +130,7 @@ class Odometry:
     def forget(self, keyframes: set[int], landmarks: set[int]) -> None:
         """These have left the graph."""
         self._waiting = {t: w for t, w in self._waiting.items() if w[0] not in keyframes}
+        self._passed = {t: [v for v in w if v[0] not in keyframes] for t, w in self._passed.items()}
         self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
         self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
         self.frames = [f for f in self.frames if f.keyframe not in keyframes]
@@ -295,16 +304,21 @@ class Odometry:
             if c_p is None or r not in agree:
                 continue
             track = int(frame.track_ids[r])
-            first_index, first_frame, first_row = self._waiting.pop(track)
+            self._waiting.pop(track)
+            self._passed.pop(track, None)
             update.guess(keys.landmark(track), pose.transformFrom(c_p))
-            self._observe(update, first_frame, first_row, first_index)
+            for earlier_index, earlier_frame, earlier_row in reversed(agree[r]):
+                self._observe(update, earlier_frame, earlier_row, earlier_index)
             self._observe(update, frame, r, index)
         for r in rows:
             track = int(frame.track_ids[r])
             if not update.values.exists(keys.landmark(track)):
+                if track in self._waiting:
+                    self._passed[track] = [self._waiting[track], *self._passed.get(track, [])][:VIEWS_PASSED]
                 self._waiting[track] = (index, frame, r)
         alive = {int(t) for t in frame.track_ids}
         self._waiting = {t: w for t, w in self._waiting.items() if t in alive or index - w[0] < 3}
+        self._passed = {t: views for t, views in self._passed.items() if t in self._waiting}
 
     def _create_from_before(self, update: Update, frame: StereoFrame, index: int, pose: gtsam.Pose3) -> None:
         """Landmarks from tracks that only the left image shows now: the keyframe that they wait in has seen both.
@@ -334,30 +348,42 @@ class Odometry:
             if r in chosen:
                 track = int(frame.track_ids[r])
                 first_index, first, first_row = self._waiting.pop(track)
+                self._passed.pop(track, None)
                 update.guess(keys.landmark(track), o_p)
                 self._observe(update, first, first_row, first_index)
                 self._observe(update, frame, r, index)
 
-    def _agreeing(self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3) -> set[int]:
-        """Rows whose point, triangulated now, is also where the earlier keyframe saw it, left and right.
+    def _agreeing(
+        self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3
+    ) -> dict[int, list[View]]:
+        """Rows whose point, triangulated now, is also where an earlier keyframe saw it, left and right; and its views.
 
         A landmark that starts from a wrong match can lie behind a camera, where its factors say nothing at all. What
         does not agree waits for another view. The median shift is taken out: it is the guess of the pose that is off.
         """
-        kept = [(r, c_p) for r, c_p in zip(rows, points, strict=True) if c_p is not None]
+        kept = [(r, pose.transformFrom(c_p)) for r, c_p in zip(rows, points, strict=True) if c_p is not None]
         if not kept:
-            return set()
-        off = np.array([self._earlier_residual(frame, r, pose.transformFrom(c_p)) for r, c_p in kept])
-        off = off - np.nanmedian(off, axis=0)
-        distance = np.linalg.norm(off.reshape(-1, 2, 2), axis=2).max(axis=1)
+            return {}
+        newest = [self._waiting[int(frame.track_ids[r])] for r, _ in kept]
+        off = np.array([self._earlier_residual(view, o_p) for view, (_, o_p) in zip(newest, kept, strict=True)])
+        shift = np.nanmedian(off, axis=0)
+        distance = np.linalg.norm((off - shift).reshape(-1, 2, 2), axis=2).max(axis=1)
         spread = 1.4826 * float(np.nanmedian(distance))
         sigma = np.array([np.sqrt(np.trace(frame.left_covariance_px2[r]) / 2) for r, _ in kept])
         limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
-        return {r for (r, _), d, most in zip(kept, distance, limit, strict=True) if d < most}
+        found: dict[int, list[View]] = {}
+        for (r, o_p), view, d, most in zip(kept, newest, distance, limit, strict=True):
+            views = [view] if d < most else []
+            for passed in self._passed.get(int(frame.track_ids[r]), []):
+                off_px = (self._earlier_residual(passed, o_p) - shift).reshape(2, 2)
+                views += [passed] if np.linalg.norm(off_px, axis=1).max() < most else []
+            if views:
+                found[r] = views
+        return found
 
-    def _earlier_residual(self, frame: StereoFrame, row: int, o_p: Float) -> Float:
-        """Pixels of the waiting keyframe less those of a point, left then right, shape (4,); NaN behind a camera."""
-        index, earlier, earlier_row = self._waiting[int(frame.track_ids[row])]
+    def _earlier_residual(self, view: View, o_p: Float) -> Float:
+        """Pixels of a keyframe less those of a point, left then right, shape (4,); NaN behind a camera."""
+        index, earlier, earlier_row = view
         o_T_left = self._state.pose(keys.keyframe(index))
         o_T_right = o_T_left.compose(self._state.pose(keys.extrinsics("m_right")))
         residual = np.full(4, np.nan)

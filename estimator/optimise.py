@@ -11,10 +11,7 @@ from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
 from ..io.ordering import OrderReport
 from ..io.reader import LogReader
-from .depth_run import depth_alone, depth_result
-from .pipeline import Pipeline
 from .result import Result
-from .run import finish
 from .sensed_log import SensedLog, opened
 from .stopwatch import Stopwatch
 
@@ -57,8 +54,12 @@ def optimise(
     watch = Stopwatch()
     with LogReader(log) as reader:
         rig = rig_of(reader, rig_file)
-    pipeline = Pipeline(rig)
     with opened(log, rig, processes) as recording, told_of(log, recording):
+        from .depth_run import depth_alone, depth_result  # the graph's libraries load while the front ends start
+        from .pipeline import Pipeline
+        from .run import finish
+
+        pipeline = Pipeline(rig)
         with watch("run"):
             for stamp_ns in pipeline.run(recording):
                 if progress is not None:

@@ -44,7 +44,7 @@ class OutlineSearch:
         """A keyframe's pictures, and the clicks in them."""
         self._kept.append(pair)
         self._kept_bytes += pair.nbytes
-        while self._kept_bytes > KEPT_BYTES:
+        while self._kept_bytes > KEPT_BYTES or self._kept[0].stamp_ns not in self._engine.keyframe_at:
             self._kept_bytes -= self._kept.popleft().nbytes
         for pick in picks:
             if pick.role in AXIS_ROLES and pick.camera in MOBILE:

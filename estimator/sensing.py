@@ -1,6 +1,6 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeGuard
 
@@ -21,7 +21,6 @@ from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
 
 Item = Message | StereoPair
-Tracked = Callable[[StereoFrame], object]
 
 COMPRESSED = "/compressed"
 COLOUR_PERIOD_NS = 1_000_000_000
@@ -100,19 +99,35 @@ class Sensing:
         left, right = self.rig.cameras.m_left.image_topic, self.rig.cameras.m_right.image_topic
         return _same_stamp(stereo_pairs(ordered, left, right, report=self._pairing))
 
-    def process(self, group: list[Item], tracked: Tracked | None = None) -> Sensed:
-        """All messages of one stamp.
+    def process(self, group: list[Item]) -> Sensed:
+        """All messages of one stamp."""
+        return self.look(group, self.follow(group))
+
+    def follow(self, group: list[Item]) -> StereoFrame | None:
+        """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
+
+        Raises:
+            LogError: the pair cannot be used.
+        """
+        self.calibrate(group)
+        pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
+        return self.sensors.track(pair) if pair is not None else None
+
+    def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
+        """Everything else that a group shows.
 
         Args:
-            tracked: told of the frame's motion at once, before anything else is looked for.
+            frame: what `follow`, of this object or another, has said of the pair.
+
+        Raises:
+            LogError: a part of it cannot be used.
         """
         stamp_ns = _stamp(group[0])
         self.calibrate(group)
-        pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
+        pair = None
+        if frame is not None:
+            pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
         picks = tuple(self._pick(i) for i in group if isinstance(i, Message) and isinstance(i.body, PickBody))
-        frame = self.sensors.track(pair) if pair is not None else None
-        if frame is not None and tracked is not None:
-            tracked(frame)
         kept = pair if frame is not None and (frame.is_keyframe or picks or not self._started) else None
         self._started |= frame is not None
         sightings = self._sightings(stamp_ns, group, kept)

@@ -34,6 +34,8 @@ from .measurement_level_world import World
 Measurement = MarkerSighting | StereoFrame | CloudFrame | CylinderSighting | Pick | OutlineSighting
 START_NS = 1_000_000_000
 COLOUR_SIZE = (640, 480)
+OUTLIER_STREAM = 1
+"""Last word of the seed from which outliers are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,8 @@ class Run:
 
 def draw(scenario: Scenario, seed: int) -> Run:
     """One run. The same scenario and seed give the same run."""
-    world = _build_world(scenario, np.random.default_rng([scenario.seed, seed]))
+    seeds = [scenario.seed, seed]
+    world = _build_world(scenario, np.random.default_rng(seeds), np.random.default_rng([*seeds, OUTLIER_STREAM]))
     measurements: list[Measurement] = [
         *stereo_frames(world),
         *marker_sightings(world),
@@ -88,7 +91,7 @@ def base_rig(scenario: Scenario, side: float, radius_m: float) -> Rig:
     return Rig.model_validate(merged(rig.model_dump(mode="json", by_alias=True), scenario.rig))
 
 
-def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
+def _build_world(scenario: Scenario, rng: np.random.Generator, outlier_rng: np.random.Generator) -> World:
     nominal_radius_m = 0.5 * float(rng.choice([0.06, 0.089, 0.11]))
     rig = base_rig(scenario, float(rng.choice([-1.0, 1.0])), nominal_radius_m)
     # A wide draw would be a pipe of another kind than the file says.
@@ -119,6 +122,7 @@ def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
         points_w=_named_points(scenario, scene, rng),
         insets=_insets(scenario, rng),
         rng=rng,
+        outlier_rng=outlier_rng,
     )
 
 

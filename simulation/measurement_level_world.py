@@ -30,6 +30,8 @@ class World:
     insets: Float
     """Shape (2,): how far inside of its two outlines a pipe's edges are seen, in all views, in parts of its radius."""
     rng: np.random.Generator
+    outlier_rng: np.random.Generator
+    """Of its own, so that a run with outliers has the scene and noise of the one without."""
 
 
 def project(camera: TrueCamera, w_T_camera: Float, points_w: Float) -> tuple[Float, Float]:

@@ -83,7 +83,7 @@ class GraphLoop:
         """
         if self._first_ns is None:
             self._first_ns = sensed.stamp_ns
-        before = self.engine.odometry.last_keyframe
+        before, told = self.engine.odometry.last_keyframe, self._told()
         try:
             self.pipeline.take(sensed)
         except ObservabilityError as error:
@@ -92,12 +92,17 @@ class GraphLoop:
             raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
         new = self.engine.odometry.last_keyframe > before
         clicked = bool(sensed.bundle.picks)
-        self._changed |= new or clicked or sensed.depth is not None
+        self._changed |= new or clicked or self._told() != told
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
         self._bounded.tidy()
         self._answer_when_due(sensed.stamp_ns, clicked, busy)
+
+    def _told(self) -> tuple[int, int]:
+        """Changes with each factor that enters or leaves."""
+        log = self.engine.solver.log
+        return len(log.factors), len(log.off)
 
     def look_back(self, sensed: Sensed) -> bool:
         """A click in a frame that has passed."""

@@ -12,7 +12,7 @@ from ..sensing import Sensed
 from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
-from .parent import end_with_parent
+from .parent import GRAPH_NICE, end_with_parent, give_way
 from .settings import StreamSettings
 from .wire import Died, Done, LateClick, Order, Ready
 
@@ -30,11 +30,15 @@ class GraphTask:
     """A checkpoint to begin with."""
     checkpoint: Path | None
     validated: ValidatedRange | None
+    patient: bool = False
+    """The sources wait, so that no pose is late."""
 
 
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     end_with_parent()
+    if not task.patient:
+        give_way(GRAPH_NICE)
     try:
         loop = _started(task, out, task.prior)
         out.put(Ready("graph"))

@@ -17,8 +17,10 @@ class StreamSettings:
     queue_count: int = 400
     queue_bytes: int = 256 << 20
     """Between the receiving threads and the ordering: the oldest messages beyond are dropped and counted."""
-    sensing_ahead: int = 4
-    """Groups of messages that are handed to the front ends at a time: newer ones wait where they can be dropped."""
+    tracking_ahead: int = 4
+    """Groups of messages that are handed to the tracking at a time: newer ones wait where they can be dropped."""
+    looking_ahead: int = 100
+    """Groups that the other front ends may be behind the tracking."""
     graph_ahead: int = 200
     """Stamps that the graph may be behind the front ends."""
     recent_ns: int = 15 * S

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ...factors.measurements import Event
+from ...factors.measurements import Event, StereoFrame
 from ...io.live.interfaces import Outline
 from ..decision import Decision
 from ..result import CalibrationEstimate, PipeEstimate, PointEstimate
@@ -24,8 +24,17 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
+class Tracked:
+    """From the tracking to the other front ends: a group, and what became of its pair."""
+
+    items: list[Item]
+    frame: StereoFrame | None
+    """None where there is no pair, or none that can be used."""
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
-    """From the front ends at once: how the mobile camera moved."""
+    """From the tracking at once: how the mobile camera moved."""
 
     stamp_ns: int
     last_T_this: Float
@@ -33,11 +42,17 @@ class Frame:
     is_keyframe: bool
     lost: bool
     inliers: int
+    taken_ns: int = 0
+    """When the tracking took the pair, by the monotonic clock, which is the same for all processes."""
+    tracked_ns: int = 0
+    """When it was done."""
+    cpu_s: float = 0.0
+    """Processor time that it took."""
 
 
 @dataclass(frozen=True, slots=True)
 class Worked:
-    """From the front ends: a group is done."""
+    """From the front ends: a group is done, or could not be tracked."""
 
     outlines: Mapping[str, tuple[Outline, ...]] = field(default_factory=dict)
     """Markers seen, by camera."""
@@ -47,6 +62,8 @@ class Worked:
     picks: int = 0
     cpu_s: float = 0.0
     """Processor time that it took."""
+    left_out: int = 0
+    """Images of the machine's camera that were left out, because the front ends are behind."""
 
 
 @dataclass(frozen=True, slots=True)

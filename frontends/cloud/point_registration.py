@@ -21,7 +21,7 @@ LOOSE_M, LOOSE_RAD = 3.0, 3.0
 """Directions that the pairs leave free keep the guess: so wide a prior informs of nothing."""
 SAME_SIDE_COSINE = 0.1
 VIEW_RAD = np.deg2rad(1.5)
-"""Samples so near to a point's direction tell what the depth camera sees there; where samples lie farther apart, more."""
+"""Samples so near to a point's direction tell what the depth camera sees there; coarser cameras have wider spacing."""
 VIEW_SAMPLES = 4
 CLEAR_M = 0.12
 """A point so far before a surface, beyond its own noise, stands where the depth camera sees through."""

@@ -92,8 +92,9 @@ class EdgePixels:
     def rows(self, start: int, stop: int) -> "EdgePixels":
         """Some stretches, with the numbers of the edges as they are."""
         part = slice(start, stop)
-        tables = (self.grey, self.depth, self.along, self.weight, self.half_width, self.evenness, self.edge)
-        return EdgePixels(*(table[part] for table in tables), noise=self.noise)
+        grey, depth, along, weight = (t[part] for t in (self.grey, self.depth, self.along, self.weight))
+        half_width, evenness = self.half_width[part], self.evenness[part]
+        return EdgePixels(grey, depth, along, weight, half_width, evenness, self.edge[part], self.noise)
 
     def only(self, edges: NDArray[np.bool_]) -> "EdgePixels":
         """The pixels of some edges, (edges,), which are numbered anew."""

@@ -9,7 +9,7 @@ from ..undistort import distort, undistort
 from . import points
 from .detection import apart, detect
 from .flow import checked_flow, inside
-from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, project, transform
+from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
 from .keyframes import keyframe_reason
 from .landmarks import LandmarkStore
 from .motion import Motion, estimate_motion
@@ -27,6 +27,8 @@ Bool = NDArray[np.bool_]
 
 _FADING = 0.7
 """Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
+_CALM_PX = 1.5
+"""Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
 
 class StereoFrontEnd:
@@ -60,6 +62,8 @@ class StereoFrontEnd:
         self._chain_T_keyframe = np.eye(4)
         self._keyframe_T_last = np.eye(4)
         self._velocity = np.zeros(6)
+        self._surprise_px = np.inf
+        """By how much the last flow differed from what constant velocity foretold."""
 
     @property
     def chain_T_keyframe(self) -> Float:
@@ -80,12 +84,13 @@ class StereoFrontEnd:
             return self._restart(pair, np.eye(4), lost=False)
         guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
         self._track(self._last, pair, guess)
-        motion = self._motion_of_flow(guess)
+        left_px = undistort(self.rig.left, self._tracks.raw_px)[0]
+        motion = self._motion_of_flow(left_px, guess)
         if motion is None:
             return self._recover(pair, guess)
         pose = motion.reference_T_this
-        if self._wants_keyframe(pose) is None:
-            return self._plain_frame(pair, motion)
+        if self._wants_keyframe(left_px, pose) is None:
+            return self._plain_frame(pair, left_px, motion)
         return self._keyframe(pair, pose) or self._recover(pair, pose)
 
     def relocalise(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> list[Relocalisation]:
@@ -132,15 +137,19 @@ class StereoFrontEnd:
     def _track(self, last: StereoPair, pair: StereoPair, guess: Float) -> None:
         """Flow from the last left image into this one; what does not come back ends."""
         tracks, settings = self._tracks, self.settings
+        expected = self._flow_guess(guess)
         found, good = checked_flow(
             last.left_as_bright_as(pair),
             pair.left,
             tracks.raw_px,
-            self._flow_guess(guess),
+            expected,
             settings.flow_window_px,
             settings.pyramid_levels,
             settings.forward_backward_px,
+            first_levels=int(self._surprise_px > _CALM_PX),
         )
+        surprise = np.abs(found - expected)[good]
+        self._surprise_px = median(surprise.max(axis=1)) if len(surprise) else np.inf
         tracks.raw_px = np.where(good[:, None], found, tracks.raw_px)
         self._end(~(good & inside(found, pair.left.shape, 3.0)))
 
@@ -157,12 +166,12 @@ class StereoFrontEnd:
         after = distort(camera, project(transform(inverse(guess), tracks.points), camera))
         shift = after - before
         known = np.isfinite(shift).all(axis=1)
-        shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
+        if not known.all():
+            shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
         return tracks.raw_px + np.clip(shift, -0.3 * self._diagonal, 0.3 * self._diagonal)
 
-    def _motion_of_flow(self, guess: Float) -> Motion | None:
+    def _motion_of_flow(self, left_px: Float, guess: Float) -> Motion | None:
         """Motion since the last keyframe from left pixels as the flow leaves them."""
-        left_px = undistort(self.rig.left, self._tracks.raw_px)[0]
         px = np.hstack((left_px, np.full_like(left_px, np.nan)))
         covariance = np.broadcast_to(self._noise.flow_variance * np.eye(4), (len(px), 4, 4))
         motion = self._robust_motion(px, covariance, guess)
@@ -196,11 +205,13 @@ class StereoFrontEnd:
 
     def _well_spread(self, px: Float) -> bool:
         """Inliers in one corner or on one line hold the pose badly."""
-        spread = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(px.T))[0]), 0.0))
-        return spread > self.settings.min_spread * self._diagonal
+        u, v = (px - px.mean(axis=0)).T
+        uu, uv, vv = (float(product) / (len(px) - 1) for product in (u @ u, u @ v, v @ v))
+        least = 0.5 * (uu + vv) - float(np.hypot(0.5 * (uu - vv), uv))
+        return least > (self.settings.min_spread * self._diagonal) ** 2
 
-    def _wants_keyframe(self, pose: Float) -> str | None:
-        flow = undistort(self.rig.left, self._tracks.raw_px)[0] - self._tracks.keyframe_px
+    def _wants_keyframe(self, left_px: Float, pose: Float) -> str | None:
+        flow = left_px - self._tracks.keyframe_px
         flow = flow[np.isfinite(flow).all(axis=1)]
         return keyframe_reason(flow, pose, len(self._tracks), self._keyframe_count, self._diagonal, self.settings)
 
@@ -213,9 +224,8 @@ class StereoFrontEnd:
         self._last = pair
         return last_T_this
 
-    def _plain_frame(self, pair: StereoPair, motion: Motion) -> StereoFrame:
+    def _plain_frame(self, pair: StereoPair, left_px: Float, motion: Motion) -> StereoFrame:
         tracks = self._tracks
-        left_px = undistort(self.rig.left, tracks.raw_px)[0]
         n = len(tracks)
         frame = StereoFrame(
             stamp_ns=pair.stamp_ns,

@@ -12,8 +12,8 @@ _LARGEST_OFFSET_PX = 0.3
 
 
 def transform_each(a_T_b: Float, b_p: Float) -> Float:
-    """Points (n, 3), each with a pose (n, 4, 4) of its own."""
-    return (a_T_b[:, :3, :3] @ b_p[:, :, None])[:, :, 0] + a_T_b[:, :3, 3]
+    """Points (..., n, 3), each with a pose (n, 4, 4) of its own."""
+    return (a_T_b[:, :3, :3] @ b_p[..., None])[..., 0] + a_T_b[:, :3, 3]
 
 
 def inverse_each(poses: Float) -> Float:
@@ -42,13 +42,13 @@ def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) 
     moved[:] = points
     moved[1, :, 0] += points[:, 2] / rig.left.fx
     moved[2, :, 1] += points[:, 2] / rig.left.fy
-    here = np.stack([transform_each(this_T_patch, corner) for corner in moved])
+    here = transform_each(this_T_patch, moved)
     warps = []
     for camera, seen in ((rig.left, here), (rig.right, here @ rig.right_T_left[:3, :3].T + rig.right_T_left[:3, 3])):
-        px = np.stack([project(corner, camera) for corner in seen])
+        px = project(seen, camera)
         warp = np.stack((px[1] - px[0], px[2] - px[0]), axis=2)
         warp = _with_lens(warp, px[0], project(points, rig.left), camera, rig.left)
-        determinant = np.linalg.det(np.nan_to_num(warp))
+        determinant = warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0]
         usable = known & np.isfinite(warp).all(axis=(1, 2)) & (determinant > 0.1) & (determinant < 10.0)
         warps.append(np.where(usable[:, None, None], warp, np.eye(2)))
     return warps[0], warps[1]
@@ -75,10 +75,10 @@ def warp_offsets(
     moved[2, :, 0] -= step[:, 0]
     moved[3, :, 1] += step[:, 1]
     moved[4, :, 1] -= step[:, 1]
-    here = np.stack([transform_each(this_T_patch, place) for place in moved])
+    here = transform_each(this_T_patch, moved)
     offsets = []
     for camera, seen in ((rig.left, here), (rig.right, here @ rig.right_T_left[:3, :3].T + rig.right_T_left[:3, 3])):
-        px = np.stack([project(place, camera) for place in seen])
+        px = project(seen, camera)
         offset = 0.5 * moment_px2 / _BEND_STEP_PX**2 * (px[1:].sum(axis=0) - 4.0 * px[0])
         usable = known & np.isfinite(offset).all(axis=1) & (np.abs(offset) < _LARGEST_OFFSET_PX).all(axis=1)
         offsets.append(np.where(usable[:, None], offset, 0.0))
