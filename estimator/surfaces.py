@@ -154,7 +154,7 @@ class Surfaces:
         cell = (int(np.floor(x / z / np.tan(SMOOTH_RAD))), int(np.floor(y / z / np.tan(SMOOTH_RAD))))
         self._shared[cell] = self._shared.get(cell, 0) + 1
         shared = SMOOTH_SHARE * abs(float(match.normal @ match.point_m))
-        return float(np.hypot(match.sigma_m, self._shared[cell] * shared))
+        return float(np.hypot(match.sigma_m, np.sqrt(self._shared[cell]) * shared))
 
 
 def _same_side(
