@@ -18,7 +18,7 @@ _MISSING = {
     "p": "pick the point again from another place",
     "u": "see the pipe from another side",
     "v": "see the pipe from another side",
-    "w": "see the pipe's edges from near and far",
+    "w": "give the pipe's nominal diameter in the rig file",
     "r": "see both edges of the pipe, or give its nominal diameter in the rig file",
     "k": "give the camera's calibration smaller sigmas in the rig file, or freeze it",
     "e": "give the extrinsics smaller sigmas in the rig file, or freeze them",

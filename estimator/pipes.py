@@ -35,9 +35,10 @@ WIDE_RADIUS_M = (0.05, 0.04)
 GAUGE_HALF_LENGTH_M = 0.25
 EDGE_FLOOR_PX = 0.3
 """Shading and a background of like brightness move an edge: rms on rendered recordings, beyond what its fit says."""
-INSET_SIGMA_PX = 0.5
-"""What the edges of one side share over all views, because light and finish stay the same: the fit takes an edge within
-the pipe for its outline. Rms of the mean over a recording's edges of one side, on rendered recordings: 0.45 px."""
+INSET_SHARE = 0.05
+"""Part of a pipe's radius by which the visible edges of one side may lie within its outline in all views alike: stripes
+of its finish, highlights and shadow have edges along the pipe as well. Rms over the sides of pipes in rendered
+recordings: 0.45 px at half widths of 7 to 12 px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,9 +318,11 @@ class Pipes:
         key = keys.inset(pipe, side)
         if update.values.exists(key) or self._state.has(key):
             return
+        thickness = keys.radius(pipe)
+        radius = update.values.atVector(thickness) if update.values.exists(thickness) else self._state.vector(thickness)
         update.guess(key, np.zeros(1))
         record = Record("calibration priors", "pipe edges", stamp_ns, "inset of a pipe's edges", rejectable=False)
-        update.add(inset_prior(pipe, side, INSET_SIGMA_PX), record)
+        update.add(inset_prior(pipe, side, INSET_SHARE * float(radius[0])), record)
 
     def _attach(self, point: _Point, update: Update) -> None:
         """Puts a point on the axis of its pipe, once both are known."""

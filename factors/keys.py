@@ -80,7 +80,7 @@ def radius(pipe: int) -> int:
 
 
 def inset(pipe: int, side: int) -> int:
-    """How far the visible edges of a side (0, 1) of a pipe lie inside its outline [px]: Vector1."""
+    """How far the visible edges of a side (0, 1) of a pipe lie inside its outline [m]: Vector1."""
     return gtsam.symbol("w", 2 * pipe + side)
 
 

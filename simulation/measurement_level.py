@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..estimator.baseline import ClickedPoint
-from ..estimator.pipes import INSET_SIGMA_PX
+from ..estimator.pipes import INSET_SHARE
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
@@ -120,7 +120,7 @@ def _build_world(scenario: Scenario, rng: np.random.Generator, outlier_rng: np.r
         stamps_ns=stamps_ns,
         place_stamps_ns=tuple(stamps_ns[i] for i in nearest),
         points_w=_named_points(scenario, scene, rng),
-        insets_px=_insets(scenario, rng),
+        insets=_insets(scenario, rng),
         rng=rng,
         outlier_rng=outlier_rng,
     )
@@ -130,7 +130,7 @@ def _insets(scenario: Scenario, rng: np.random.Generator) -> Float:
     """What the pipe's edges share, shape (2,); from a stream of its own, so that nothing else is drawn anew."""
     if not scenario.faults:
         return np.zeros(2)
-    return rng.spawn(1)[0].normal(0.0, INSET_SIGMA_PX, 2) * scenario.noise_factors.outlines
+    return rng.spawn(1)[0].normal(0.0, INSET_SHARE, 2) * scenario.noise_factors.outlines
 
 
 def _named_points(scenario: Scenario, scene: Scene, rng: np.random.Generator) -> dict[str, Float]:
