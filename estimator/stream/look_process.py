@@ -16,7 +16,8 @@ from ...frontends.undistort import distort
 from ...io.live.interfaces import Outline
 from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
-from ..sensing import Item, Sensing, images
+from ..items import Item, unreadable
+from ..sensing import Sensing, images
 from ..sensors import PairImages
 from .parent import LOOK_NICE, end_with_parent, give_way
 from .settings import StreamSettings
@@ -86,7 +87,7 @@ class LookLoop:
         """A group. Whatever is wrong with it is told, and the stream goes on."""
         items = tracked.items
         began = time.process_time()
-        problem, outlines, picks = None, {}, 0
+        problem, bad, outlines, picks = None, (), {}, 0
         stamp_ns = items[0].stamp_ns
         try:
             clicks = [item for item in items if isinstance(item, Message) and _on_mobile(item)]
@@ -96,8 +97,9 @@ class LookLoop:
             else:
                 outlines = self._present(items, tracked.frame)
         except SurecutError as error:
-            problem = " ".join(str(error).split())
-        self._out.put(Worked(outlines, stamp_ns, problem, picks, time.process_time() - began))
+            problem, bad = " ".join(str(error).split()), unreadable(items)
+        cpu_s = time.process_time() - began
+        self._out.put(Worked(outlines, stamp_ns, problem, picks, cpu_s, unreadable=bad))
 
     def _present(self, items: list[Item], frame: StereoFrame | None) -> dict[str, tuple[Outline, ...]]:
         self._note(items)
