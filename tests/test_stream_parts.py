@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from stream_messages import LEFT, MS, RIG, RIGHT, START, image
 
+from surecut.estimator.bundle import Bundle
 from surecut.estimator.decision import Decision
+from surecut.estimator.sensing import Sensed
 from surecut.estimator.stream.follower import Follower
 from surecut.estimator.stream.ordering import LiveOrder
 from surecut.estimator.stream.settings import StreamSettings
+from surecut.estimator.stream.thinning import Thinning
 from surecut.estimator.stream.trust import EXPIRED, grown, verdict_of
 from surecut.estimator.stream.wire import Frame, Place
+from surecut.factors.measurements import StereoFrame
 from surecut.factors.rig import Cut
 from surecut.io.messages import Message, PickBody
 from surecut.io.pairing import StereoPair
@@ -191,3 +195,46 @@ def test_verdict_expires():
     assert verdict_of(decision, START + 31_000 * MS)[0] == EXPIRED
     assert verdict_of(replace(decision, expires_ns=None), START)[0] == EXPIRED
     assert verdict_of(None, START)[0] == "MEASURE MORE"
+
+
+class Behind(list):
+    """A queue of a graph that is so far behind."""
+
+    put = list.append
+    backlog = 0
+
+    def qsize(self):
+        return self.backlog
+
+
+def moved(number, keyframe=False, lost=False):
+    stamp, none, covariance = START + number * 50 * MS, np.empty((0, 2)), np.empty((0, 2, 2))
+    seen = np.empty(0, int), none, covariance, none, covariance
+    return Sensed(Bundle(stamp, StereoFrame(stamp, keyframe, *seen, step(0.01), 50, lost)))
+
+
+def test_graph_that_does_not_keep_up_gets_fewer_frames_and_the_whole_motion():
+    graph = Behind()
+    thinning = Thinning(graph, StreamSettings(), patient=False)
+    for i in range(40):
+        graph.backlog = 100 if i >= 10 else 0
+        thinning.put(moved(i, keyframe=i % 2 == 0, lost=i == 21))
+    frames = [sensed.bundle.frame for sensed in graph]
+    assert [f.stamp_ns for f in frames[:10]] == [START + i * 50 * MS for i in range(10)]
+    assert all(f.is_keyframe for f in frames[10:])
+    assert 2 <= len(frames) - 10 <= 3  # half a second apart
+    np.testing.assert_allclose(
+        sum(f.last_T_this[0, 3] for f in frames), 0.01 * (1 + (frames[-1].stamp_ns - START) / 50 / MS)
+    )
+    assert [f.lost for f in frames].count(True) == 1
+    assert thinning.taken() == 40 - len(frames)
+    assert thinning.taken() == 0
+
+
+def test_patient_sources_are_never_thinned():
+    graph = Behind()
+    graph.backlog = 199
+    thinning = Thinning(graph, StreamSettings(), patient=True)
+    for i in range(20):
+        thinning.put(moved(i))
+    assert len(graph) == 20

@@ -290,6 +290,7 @@ class Stream:
     def _worked(self, worked: Worked) -> None:
         self._count("looking_cpu_us", round(1e6 * worked.cpu_s))
         self._count("left_out", worked.left_out)
+        self._count("thinned", worked.thinned)
         for topic in worked.unreadable:
             self._tally.add("malformed", topic)
         if worked.problem is not None:

@@ -74,6 +74,8 @@ class Worked:
     """Images of the machine's camera that were left out, because the front ends are behind."""
     unreadable: tuple[str, ...] = ()
     """Topics of images in it that cannot be decoded."""
+    thinned: int = 0
+    """Frames that the graph was spared, see `thinning`."""
 
 
 @dataclass(frozen=True, slots=True)
