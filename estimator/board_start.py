@@ -97,7 +97,7 @@ class FirstPose:
                 return Side(board.side_m, None)
             spread = np.array([sheet.marker(s.marker).centre_m for s in mine])
             radius = float(np.sqrt(((spread - spread.mean(0)) ** 2).sum()))
-            half_px = 0.5 * np.mean([s.diagonal_px for s in mine])
+            half_px = 0.5 * float(np.mean([s.diagonal_px for s in mine]))
             inset = inset_sigma_px(mine[0], self._rig.noise) / half_px
             place = board.centre_sigma_m * np.sqrt(2) / radius
             return Side(length, float(np.linalg.norm([sigma, length * place, length * inset])))

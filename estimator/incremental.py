@@ -41,6 +41,9 @@ of a batch solution; `settle` makes up for what is left at the end."""
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
 
+MOVED_ROUNDS = 3
+"""Steps after a part of the map was moved."""
+
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
 
@@ -73,6 +76,7 @@ class Incremental:
         self._slots: list[int | None] = []
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
+        self._relocated = False
         self.log = FactorLog()
         self.dropped: list[int] = []
         """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
@@ -92,6 +96,11 @@ class Incremental:
         first = self._isam.getFactorsUnsafe().size()
         self.log.append(update)
         self.log.off.update(removed)
+        if self._relocated:
+            self._relocated = False
+            self._values.insert(update.values)
+            self._begin(self._values)
+            return self.settle(MOVED_ROUNDS)
         try:
             with determined():
                 self._isam.update(graph, update.values, slots)
@@ -215,8 +224,18 @@ class Incremental:
         except Undetermined:
             self._restart()
             return
-        self._slots = list(range(len(self.log.factors)))
+        active = np.array([i not in self.log.off for i in range(len(self.log.factors))], dtype=bool)
+        places = np.cumsum(active) - 1
+        self._slots = [int(place) if on else None for place, on in zip(places, active, strict=True)]
         self._values = self._isam.calculateEstimate()
+
+    def relocate(self, values: gtsam.Values) -> gtsam.Values:
+        """Values that no step would reach, because a part of the map has been found to lie elsewhere.
+
+        The next update brings what holds it there; the solver begins anew with that.
+        """
+        self._values, self._relocated = values, True
+        return gtsam.Values(values)
 
     def settle(self, rounds: int) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from ..bounded import Limits
+from ..limits import Limits
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -13,9 +13,9 @@ from ..undistort import distort
 from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
-from .images import Float32, smooth
+from .images import Float32, Picture, smooth
 from .tracks import CROP_SIDE, Int, Tracks
-from .warp import linear_warps, warp_offsets
+from .warp import bend_offsets, curvatures, linear_warps
 
 Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
@@ -27,7 +27,7 @@ _LARGEST_TURN = np.cos(np.deg2rad(35.0))
 _MISSES = 12
 
 
-def crops(image: Float32, raw_px: Float, grid: PatchGrid) -> Image:
+def crops(image: Picture, raw_px: Float, grid: PatchGrid) -> Image:
     """Surroundings (n, s, s) of places (n, 2) in a smoothed image."""
     side = round(len(grid.weights) ** 0.5)
     values = grid.sample(image, raw_px) if len(raw_px) else np.zeros((0, side * side))
@@ -126,7 +126,7 @@ class LandmarkStore:
     def find_left(
         self,
         image: Image,
-        smoothed: Float32,
+        smoothed: Picture,
         candidates: Candidates,
         chain_T_this: Float,
         rig: StereoGeometry,
@@ -142,11 +142,12 @@ class LandmarkStore:
         tiles, centres = _mosaic(self.tiles[rows])
         this_T_patch = inverse(chain_T_this) @ self.patch_poses[rows]
         warp = linear_warps(self.patch_points[rows], this_T_patch, rig)[0]
-        off = warp_offsets(self.patch_points[rows], this_T_patch, rig, grid.moment_px2)[0]
         # Each tile is low-passed by itself: the mosaic's seams lie beyond the coarse patch.
-        coarse = make_patches(_low_pass(tiles), centres, _COARSE_GRID)
-        first = align(smooth(image, _COARSE_SMOOTHING_PX), coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
-        fine = make_patches(tiles, centres, grid, variance)
+        coarse = make_patches(Picture(_low_pass(tiles)), centres, _COARSE_GRID)
+        blurred = Picture(smooth(image, _COARSE_SMOOTHING_PX))
+        first = align(blurred, coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
+        fine = make_patches(Picture(tiles), centres, grid, variance)
+        off = bend_offsets(warp, fine.bend, curvatures(self.patch_points[rows], this_T_patch, rig)[0])
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
         second = align(smoothed, fine, start, warp, grid, 10).moved(-off)
         return second, fine, second.converged & (second.correlation > min_correlation)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..undistort import distort, undistort
 from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .geometry import Float, StereoGeometry, inverse, project, rays, transform
-from .images import Float32
+from .images import Picture
 from .landmarks import CROP_GRID, crops
 from .matching import search_right
 from .noise import NoiseModel
@@ -16,7 +16,7 @@ from .pair import StereoPair
 from .settings import StereoSettings
 from .sighting import Sighting
 from .tracks import Int, Tracks, new_tracks
-from .warp import linear_warps, warp_offsets
+from .warp import bend_offsets, curvatures, linear_warps
 
 Bool = NDArray[np.bool_]
 
@@ -26,8 +26,8 @@ class Keyview:
     """A keyframe's pair with its smoothed images."""
 
     pair: StereoPair
-    left: Float32
-    right: Float32
+    left: Picture
+    right: Picture
     noise: float
     """Standard deviation of the pixel noise, grey values."""
 
@@ -68,7 +68,8 @@ class Observer:
         """
         this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
         warps = linear_warps(tracks.patch_points, this_T_patch, self._rig)
-        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)
+        curved = curvatures(tracks.patch_points, this_T_patch, self._rig)
+        off = [bend_offsets(*pair) for pair in zip(warps, [tracks.patches.bend] * 2, curved, strict=True)]
         left = align(view.left, tracks.patches, tracks.raw_px + off[0], warps[0], self.grid).moved(-off[0])
         left_px, left_covariance = self._left(left)
         seen = self.accepts(left) & np.isfinite(left_px).all(axis=1)
@@ -82,7 +83,7 @@ class Observer:
         """Observations of n tracks whose left patches have been aligned already, with their right matches."""
         this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
         warp = linear_warps(tracks.patch_points, this_T_patch, self._rig)[1]
-        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)[1]
+        off = bend_offsets(warp, tracks.patches.bend, curvatures(tracks.patch_points, this_T_patch, self._rig)[1])
         left_px, left_covariance = self._left(left)
         start = self._expected_right(left_px, tracks.points[:, 2])
         right = align(view.right, tracks.patches, start + off, warp, self.grid).moved(-off)
