@@ -42,7 +42,7 @@ def first():
 
 
 def world_of_the_run():
-    return _build_world(SCENARIO, np.random.default_rng([SCENARIO.seed, SEED]))
+    return _build_world(SCENARIO, np.random.default_rng([SCENARIO.seed, SEED]), np.random.default_rng(0))
 
 
 def with_one_more_keyframe(world, o_T_m, monkeypatch):
