@@ -22,7 +22,7 @@ FEWEST_POINTS = 20
 LEAST_REACH_M = 0.06
 """The search goes so far beyond the predicted surface at least: a mount that is off has to show, not to hide."""
 GATE_SIGMA = 3.0
-_FIRST, _SECOND = 1000, 2500
+_FIRST, _SECOND = 700, 1800
 """Points for the place, and for the fit that is kept: more cost time and change nothing."""
 _COARSE = 8
 SHORTEST_RADII = 2.0
