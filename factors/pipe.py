@@ -76,18 +76,8 @@ def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float
     return G @ covariance @ G.T + np.eye(2) * 1e-10
 
 
-def side_of(line: Float, K: Float, a: Float, b: Float) -> int:
-    """Which side of the pipe an edge is on, 0 or 1, the same in every view of its axis from a to b.
-
-    Args:
-        line: shape (3,), oriented so that the axis lies on the positive side.
-        a, b: shape (3,), the axis points in the camera frame.
-    """
-    return int(float((K.T @ line) @ np.cross(b - a, a + b)) > 0.0)
-
-
-def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int, side: int) -> gtsam.CustomFactor:
-    """One edge of a pipe in one image. It lies inside the true outline by the inset of its side.
+def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
+    """One edge of a pipe in one image. It lies inside the true outline by the pipe's inset.
 
     Args:
         camera: `m_left`, `m_right` or `b_rgb`.
@@ -95,10 +85,9 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int,
         noise: of the residual (2,), see `tangency_covariance`.
         pose: key of `o_T_m` or `o_T_b`.
         pipe: index of the pipe.
-        side: see `side_of`.
     """
     variables = [pose, keys.intrinsics(camera), keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
-    variables.append(keys.inset(pipe, side))
+    variables.append(keys.inset(pipe))
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
@@ -169,9 +158,9 @@ def radius_prior(pipe: int, radius_m: float, sigma_m: float) -> gtsam.NonlinearF
     return gtsam.PriorFactorVector(keys.radius(pipe), np.array([radius_m]), sigmas([sigma_m]))
 
 
-def inset_prior(pipe: int, side: int, sigma_m: float) -> gtsam.NonlinearFactor:
+def inset_prior(pipe: int, sigma_m: float) -> gtsam.NonlinearFactor:
     """What is known of an inset: images alone cannot tell it from a thinner pipe."""
-    return gtsam.PriorFactorVector(keys.inset(pipe, side), np.zeros(1), sigmas([sigma_m]))
+    return gtsam.PriorFactorVector(keys.inset(pipe), np.zeros(1), sigmas([sigma_m]))
 
 
 def across_axis(direction: Float) -> Float:

@@ -157,11 +157,10 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
     """The two true edges, each shifted and turned by noise about its foot near the click."""
     camera, rng, pipe = world.true.cameras["m_left"], world.rng, world.scene.pipe
     m_T_w = invert(w_T_m)
-    place, axis = transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis
-    seen = [outline_lines(place, axis, pipe.radius_m * (1.0 - inset), camera.K) for inset in world.insets]
-    if seen[0] is None or seen[1] is None:
+    visible_m = pipe.radius_m * (1.0 - world.inset)
+    lines = outline_lines(transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis, visible_m, camera.K)
+    if lines is None:
         return None
-    lines = (seen[0][0], seen[1][1])
     half_px = 0.25 * camera.height
     offset_sigma = world.scenario.picks.outline_sigma_px / np.sqrt(half_px)
     sigmas = np.array([offset_sigma, offset_sigma * np.sqrt(3.0) / half_px])
