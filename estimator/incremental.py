@@ -29,7 +29,7 @@ _THRESHOLDS = {
     "v": [2e-4] * 3,
     "h": [1e-5, 1e-4],
     "r": [1e-4],
-    "w": [0.01],
+    "w": [1e-4],
     "k": [0.01, 0.01, 1.0, 0.01, 0.01, 1e-4, 1e-4, 1e-4, 1e-4],
     "d": [2e-4, 2e-4],
     "g": [1e-5, 1e-5, 1e-4],
@@ -41,6 +41,9 @@ of a batch solution; `settle` makes up for what is left at the end."""
 
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
+
+MOVED_ROUNDS = 3
+"""Steps after a part of the map was moved."""
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
@@ -74,6 +77,7 @@ class Incremental:
         self._slots: list[int | None] = []
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
+        self._relocated = False
         self.log = FactorLog()
         self.dropped: list[int] = []
         """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
@@ -93,6 +97,11 @@ class Incremental:
         first = self._isam.getFactorsUnsafe().size()
         self.log.append(update)
         self.log.off.update(removed)
+        if self._relocated:
+            self._relocated = False
+            self._values.insert(update.values)
+            self._begin(self._values)
+            return self.settle(MOVED_ROUNDS)
         try:
             with determined():
                 self._isam.update(graph, update.values, slots)
@@ -219,6 +228,14 @@ class Incremental:
         places = count()
         self._slots = [None if i in self.log.off else next(places) for i in range(len(self.log.factors))]
         self._values = self._isam.calculateEstimate()
+
+    def relocate(self, values: gtsam.Values) -> gtsam.Values:
+        """Values that no step would reach, because a part of the map has been found to lie elsewhere.
+
+        The next update brings what holds it there; the solver begins anew with that.
+        """
+        self._values, self._relocated = values, True
+        return gtsam.Values(values)
 
     def settle(self, rounds: int) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.

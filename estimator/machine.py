@@ -3,10 +3,8 @@
 from collections.abc import Sequence
 
 import gtsam
-import numpy as np
 
 from ..factors import keys
-from ..factors.errors import ObservabilityError
 from ..factors.geometry import pose3
 from ..factors.links import mount_factor, mount_pose, weak_pose_prior
 from ..factors.measurements import BaseMove, Event, MarkerSighting
@@ -23,11 +21,6 @@ COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
-TIED_M = 0.1
-"""How well a landmark's place has to be known before the surface that it lies on is looked for: half of what panels and
-pipes of a cell are apart."""
-SURFACE_DISTANCE_M = 2.0
-"""Of what the mobile camera sees, roughly: what its turn does to a landmark's place."""
 
 
 class Machine:
@@ -123,30 +116,10 @@ class Machine:
         return True
 
     def lay_landmarks(self, keyframe: int) -> None:
-        """The landmarks of a keyframe are laid on the surfaces that the depth camera sees.
-
-        Not while the camera's place hangs on a motion prior: what a landmark lies on would be a guess, and a set of
-        wrong surfaces holds the camera as firmly as the right one.
-        """
-        if self.placed and self._state.has(keys.DEPTH) and self._holds(keyframe):
+        """The landmarks of a keyframe are laid on the surfaces that the depth camera sees."""
+        if self.placed and self._state.has(keys.DEPTH):
             camera = self._state.pose(keys.keyframe(keyframe))
             self._graph.take(self._surfaces.lay(self.base, camera, self._odometry.observations))
-
-    def _holds(self, keyframe: int) -> bool:
-        """Is the camera's place known against the machine's, as well as surfaces have to be told apart?"""
-        if not self._odometry.adrift:
-            return True
-        self._graph.flush()
-        pair = [self.base, keys.keyframe(keyframe)]
-        b_T_m = self._state.pose(pair[0]).between(self._state.pose(pair[1]))
-        J = np.hstack([-b_T_m.inverse().AdjointMap(), np.eye(6)])
-        try:
-            covariance = J @ self._graph.solver.joint_covariance(pair) @ J.T
-        except ObservabilityError:
-            return False
-        turn, way = (float(np.sqrt(np.trace(covariance[part, part]))) for part in (slice(0, 3), slice(3, 6)))
-        self._odometry.adrift = way + turn * SURFACE_DISTANCE_M > TIED_M
-        return not self._odometry.adrift
 
     def _colour_poses(self) -> dict[str, gtsam.Pose3]:
         return {"b_rgb": self._state.pose(self.base).compose(self._state.pose(keys.extrinsics("b_rgb")))}

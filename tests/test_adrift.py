@@ -45,7 +45,7 @@ def after(gap: bool) -> tuple[int, bool]:
         engine.add(bundle)
     laid = [int(r.what.split()[1]) for _, _, r in engine.solver.log.active() if r.family == FAMILY]
     assert laid
-    return sum(track >= NEW for track in laid), engine.odometry.adrift
+    return sum(track >= NEW for track in laid), bool(engine.adrift)
 
 
 def test_no_surfaces_for_what_is_seen_after_a_gap():
