@@ -59,7 +59,8 @@ class Row:
 
 def compared(name: str, ours: Callable[[], object], plain: str, call: Callable[[], object], repeat: int = 5) -> Row:
     """Median seconds of both, by turns, after one call each: what else the machine does meets both alike."""
-    ours(), call()
+    ours()
+    call()
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeat):
         for one, taken in zip((ours, call), seconds, strict=True):
