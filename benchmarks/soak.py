@@ -16,8 +16,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
-from surecut.estimator.sensing import wanted_topics
 from surecut.estimator.stream.settings import StreamSettings
 from surecut.estimator.stream.stream import Stream
 from surecut.io.live.foxglove_server import FoxgloveServer

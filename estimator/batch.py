@@ -56,7 +56,7 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            values, more = optimum(_without(log, off), at.values)
+            values, more = optimum(without_factors(log, off), at.values)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
     at = with_correlated_tracks(at, ODOMETRY)
@@ -76,7 +76,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gts
     return values, optimiser.iterations()
 
 
-def _without(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:
+def without_factors(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for index, factor, _ in log.active():
         if index not in off:

@@ -12,7 +12,7 @@ from ..frontends.cloud.frontend import CloudConfig, CloudFrontEnd
 from ..frontends.cloud.points import cloud_from_points
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody
 from ..io.reader import LogReader
-from .sensing import COMPRESSED
+from .items import COMPRESSED
 
 SAMPLES = 2500
 """Surface samples of an image: on a real recording more made the path no better."""

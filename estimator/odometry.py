@@ -98,7 +98,7 @@ class Odometry:
         """Moves the camera by the front end's estimate; every frame passes here once, in order."""
         if not frame.lost:
             self._held_ns = frame.stamp_ns
-        if self.keyframe_stamps:
+        if self._reference >= 0:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
             self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last))
@@ -121,7 +121,7 @@ class Odometry:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
             known, rejected = self.gate.gated(frame, known, pose, self._newest())
-            connected = self._state.has(keys.keyframe(self._reference))
+            connected = self._reference >= 0 and self._state.has(keys.keyframe(self._reference))
             few = len(known) < self._settings.minimum_shared
             if connected and (self._since_keyframe_lost or few):
                 self._bridge(update, index, frame, pose, few)

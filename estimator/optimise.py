@@ -83,6 +83,7 @@ def optimise(
                 provenance,
                 report.sensing.rejected,
                 odd,
+                memory=True,
             )
 
 

@@ -63,7 +63,8 @@ class SensedHere:
     """Front ends in this process."""
 
     def __init__(self, log: Path, rig: Rig) -> None:
-        from .sensing import Sensing, wanted_topics
+        from .items import wanted_topics
+        from .sensing import Sensing
 
         self._reader = LogReader(log, wanted_topics(rig))
         self._sensing = Sensing(rig)

@@ -17,14 +17,9 @@ from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .bundle import Bundle
 from .depth_sensor import DepthView
+from .items import COLOUR_PERIOD_NS, Item, plain
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
-
-Item = Message | StereoPair
-
-COMPRESSED = "/compressed"
-COLOUR_PERIOD_NS = 1_000_000_000
-"""Boards in the Kinect's colour image: once a second is enough for a machine that stands still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +51,6 @@ class SensingReport:
     """What the front ends themselves refused."""
     depths: int = 0
     """Depth images and clouds."""
-
-
-def wanted_topics(rig: Rig) -> frozenset[str]:
-    """The topics that the estimator reads; never the truth."""
-    topics = {rig.picks_topic, rig.kinect.points_topic}
-    for name in ("m_left", "m_right", "b_rgb", "b_depth"):
-        camera = getattr(rig.cameras, name)
-        topics |= {camera.image_topic, camera.image_topic + COMPRESSED, camera.info_topic}
-        if camera.markers_topic:
-            topics.add(camera.markers_topic)
-    return frozenset(topics)
 
 
 class Sensing:
@@ -252,14 +236,6 @@ def images(pair: StereoPair) -> PairImages:
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """One channel, shape (height, width)."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def plain(message: Message) -> Message:
-    """A compressed topic counts as its raw one."""
-    if not message.topic.endswith(COMPRESSED):
-        return message
-    topic = message.topic.removesuffix(COMPRESSED)
-    return Message(topic, message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
 
 
 def _stamp(item: Item) -> int:

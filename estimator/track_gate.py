@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
+from ..factors.errors import ObservabilityError
 from ..factors.measurements import Rejection, StereoFrame
 from .graph import State
 
@@ -122,8 +123,13 @@ class TrackGate:
             by_point = K[:2, :2] @ np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
             by_pose = np.hstack([by_point @ gtsam.Rot3.Hat(c_p), -by_point]) @ to_last
             J = np.hstack([by_pose, by_point @ pose.rotation().matrix().T])
-            covariance = J @ self.joint_covariance([last, landmark]) @ J.T + frame.left_covariance_px2[r]
-            found.append(np.sqrt(off @ np.linalg.solve(covariance, off)))
+            try:
+                joint = self.joint_covariance([last, landmark])
+            except ObservabilityError:  # a landmark that nothing determines explains nothing
+                found.append(float("inf"))
+                continue
+            covariance = J @ joint @ J.T + frame.left_covariance_px2[r]
+            found.append(float(np.sqrt(off @ np.linalg.solve(covariance, off))))
         return float(np.median(found))
 
 

@@ -4,6 +4,7 @@
 pixels in OpenCV's convention. Poses are `a_T_b`: the pose of b in a.
 """
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -150,9 +151,9 @@ class Noise(Section):
 
     marker_message_sigma_px: Positive = 0.3
     """Corners that arrive as messages, with no image to judge them by."""
-    marker_common_px: NonNegative = 0.03
-    """Part of a corner's error that is the same in views from the same place, at least: 0.03 px is what fits to
-    rendered pages of many sizes leave beyond the noise of their pixels. A front end may know of more."""
+    marker_common_px: NonNegative = 0.005
+    """Part of a corner's error that is the same in views from the same place, at least: what the corner fit leaves on
+    images without noise. A front end that sees more of it in the pixels says so with each sighting."""
     pick_floor_px: NonNegative = 0.3
 
 
@@ -251,6 +252,11 @@ def load_rig(source: Path | str | bytes, name: str | None = None) -> Rig:
         return Rig.model_validate(data)
     except ValidationError as error:
         raise RigError(f"{label}: {_one_line(error)}") from error
+
+
+def sha256_of(rig: "Rig") -> str:
+    """Tells rigs apart."""
+    return hashlib.sha256(dump_rig(rig).encode()).hexdigest()
 
 
 def dump_rig(rig: Rig) -> str:

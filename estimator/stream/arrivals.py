@@ -6,7 +6,7 @@ import numpy as np
 
 from ...factors.rig import Rig
 from ...io.messages import CameraInfoBody, ImageBody, Message
-from ..sensing import COLOUR_PERIOD_NS, Item
+from ..items import COLOUR_PERIOD_NS, Item
 from .settings import StreamSettings
 
 KEPT = 4000

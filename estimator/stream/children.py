@@ -1,6 +1,5 @@
 """The three processes behind a stream and the queues between them."""
 
-import multiprocessing
 import queue
 import threading
 from collections.abc import Callable
@@ -11,13 +10,20 @@ from pathlib import Path
 from typing import Any
 
 from ..threads import single_threaded_children
-from .graph_process import GraphTask, solve
-from .look_process import look
-from .track_process import track
-from .wire import Group, Order
+from .forking import context
+from .wire import GraphTask, Group, Order
 
 NAMES = ("tracking", "front ends", "graph")
 Heard = Callable[[object], object]
+
+
+def run(what: str, *given: Any) -> None:
+    """The child's work; only there its modules are loaded."""
+    from .graph_process import solve
+    from .look_process import look
+    from .track_process import track
+
+    {"track": track, "look": look, "solve": solve}[what](*given)
 
 
 class Line:
@@ -41,7 +47,7 @@ class Children:
     def __init__(self, task: GraphTask, heard: Heard) -> None:
         self._task = task
         self._heard = heard
-        self._context = multiprocessing.get_context("spawn")
+        self._context = context()
         self._processes: list[BaseProcess] = []
         self._to_track: Any = None
         self._to_look: Any = None
@@ -53,21 +59,21 @@ class Children:
         Args:
             prior: checkpoint that the graph begins with.
         """
-        settings, context = self._task.settings, self._context
-        self._to_track = context.Queue(settings.tracking_ahead)
-        self._to_look = context.Queue(settings.looking_ahead)
-        self._to_graph = context.Queue(settings.graph_ahead)
+        settings, processes = self._task.settings, self._context
+        self._to_track = processes.Queue(settings.tracking_ahead)
+        self._to_look = processes.Queue(settings.looking_ahead)
+        self._to_graph = processes.Queue(settings.graph_ahead)
         task, rig = replace(self._task, prior=prior), self._task.rig
         work = (
-            (track, (rig, task.patient, self._to_track, self._to_look)),
-            (look, (rig, settings, task.patient, self._to_look, self._to_graph)),
-            (solve, (task, self._to_graph)),
+            ("track", (rig, task.patient, self._to_track, self._to_look)),
+            ("look", (rig, settings, task.patient, self._to_look, self._to_graph)),
+            ("solve", (task, self._to_graph)),
         )
         self._processes = []
         with single_threaded_children():
-            for target, given in work:
-                mine, theirs = context.Pipe(duplex=False)
-                process = context.Process(target=target, args=(*given, Line(theirs)), daemon=True)
+            for what, given in work:
+                mine, theirs = processes.Pipe(duplex=False)
+                process = processes.Process(target=run, args=(what, *given, Line(theirs)), daemon=True)
                 process.start()
                 theirs.close()
                 threading.Thread(target=self._listen, args=(mine,), name="surecut-results", daemon=True).start()
@@ -92,6 +98,8 @@ class Children:
 
     def backlog(self) -> int:
         """Stamps that wait for the graph."""
+        if self._to_graph is None:
+            return 0
         try:
             return self._to_graph.qsize()
         except NotImplementedError:  # macOS cannot tell

@@ -1,6 +1,5 @@
 """The graph's half of the stream: what the front ends saw in, answers out, within bounds of memory and time."""
 
-import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
-from ...factors.rig import Rig, dump_rig
+from ...factors.rig import Rig, sha256_of
 from ..bounded import Bounded
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
@@ -58,7 +57,7 @@ class GraphLoop:
         self._tell = tell
         self._checkpoint = checkpoint
         self._validated = validated
-        self._rig_sha256 = hashlib.sha256(dump_rig(rig).encode()).hexdigest()
+        self._rig_sha256 = sha256_of(rig)
         self.pipeline = Pipeline(rig)
         self.engine = self.pipeline.engine
         self._bounded = Bounded(self.engine, settings.limits)
@@ -294,6 +293,6 @@ class GraphLoop:
         memory = remember(self.engine)
         if memory is None:
             raise SurecutError("nothing to remember yet: no board has a place")
-        save(memory, self._checkpoint, self._rig_sha256)
+        save(memory, self._checkpoint, self._rig_sha256, self._answer)
         self.counts["checkpoints"] += 1
         return f"saved to {self._checkpoint}"

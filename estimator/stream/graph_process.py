@@ -2,36 +2,18 @@
 
 import queue
 import traceback
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...factors.errors import SurecutError
-from ...factors.rig import Rig
 from ..sensing import Sensed
-from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
 from .parent import GRAPH_NICE, end_with_parent, give_way
-from .settings import StreamSettings
-from .wire import Died, Done, LateClick, Order, Ready
+from .wire import Died, Done, GraphTask, LateClick, Order, Ready
 
 BUSY = 20
 """Stamps that wait from which on answers are rarer."""
-
-
-@dataclass(frozen=True, slots=True)
-class GraphTask:
-    """What the process is started with."""
-
-    rig: Rig
-    settings: StreamSettings
-    prior: Path | None
-    """A checkpoint to begin with."""
-    checkpoint: Path | None
-    validated: ValidatedRange | None
-    patient: bool = False
-    """The sources wait, so that no pose is late."""
 
 
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:

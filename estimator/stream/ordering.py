@@ -15,7 +15,7 @@ from ...factors.rig import Rig
 from ...io.live.tally import Tally
 from ...io.messages import CameraInfoBody, ImageBody, Message, PickBody
 from ...io.pairing import StereoPair
-from ..sensing import Item, plain
+from ..items import Item, plain
 
 TOLERANCE_NS = 1_000_000
 """Stamps nearer to each other than this are one moment."""

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 
 LOOK_NICE, GRAPH_NICE = 5, 10
@@ -10,6 +11,7 @@ LOOK_NICE, GRAPH_NICE = 5, 10
 
 def end_with_parent() -> None:
     """Call once in the child: a parent that was killed cannot tell."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a keyboard tells all of them; the parent ends the others in order
     parent = multiprocessing.parent_process()
     if parent is None:
         return

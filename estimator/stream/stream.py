@@ -16,18 +16,18 @@ from ...io.live.bounded import BoundedQueue, is_urgent, message_size
 from ...io.live.interfaces import Clock, Command, Freeze, LiveImage, Pick, Reply, Reset, Save, Sink, Source
 from ...io.live.tally import Tally
 from ...io.messages import ImageBody, Message, PickBody
-from ..sensing import Item, plain
+from ..items import Item, plain
 from ..validated_range import ValidatedRange
 from .arrivals import Arrivals
 from .children import NAMES, Children
 from .follower import Followed
-from .graph_process import GraphTask
 from .latency import Latencies
 from .ordering import LiveOrder
 from .publisher import update_of
+from .remembered import remembered
 from .settings import StreamSettings
 from .situation import Situation
-from .wire import Answer, Died, Done, Frame, Group, Order, Ready, Worked
+from .wire import Answer, Died, Done, Frame, GraphTask, Group, Order, Ready, Worked
 
 TICK_S = 0.003
 SWITCH_S = 0.0005
@@ -40,6 +40,8 @@ RESTARTS = 5
 """More within a minute: the fault does not go away by itself."""
 FINISH_S = 120.0
 START_S = 120.0
+START_PUBLISH_S = 0.1
+"""While the processes start, what is known is published so often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +114,9 @@ class Stream:
         switch_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:
-            self._children.start(self._begin)
             for sink in self._sinks:
                 sink.start(self._commanded)
-            self._wait_for_children()
+            self._start_children()
             for source in self._sources:
                 source.start(self._deliver_to(source))
             while not self._stopping.is_set():
@@ -135,15 +136,23 @@ class Stream:
         if self.problem is not None:
             raise SurecutError(self.problem)
 
-    def _wait_for_children(self) -> None:
-        """Messages that come before anybody can work on them would only be old when they are."""
+    def _start_children(self) -> None:
+        """Messages that come before anybody can work on them would only be old when they are. Meanwhile whoever listens
+        gets what was known at the last checkpoint."""
+        known = None if self._begin is None else remembered(self._begin, self.rig)
+        if known is not None:
+            self._situation.answered(known)
+        starting = threading.Thread(target=self._children.start, args=(self._begin,), name="surecut-start", daemon=True)
+        starting.start()
         until = time.monotonic() + START_S
-        while not self._all_ready.wait(0.05) and not self._stopping.is_set():
-            dead = self._children.dead()
+        while not self._all_ready.wait(START_PUBLISH_S) and not self._stopping.is_set():
+            self._publish(None)
+            dead = None if starting.is_alive() else self._children.dead()
             if dead is not None or time.monotonic() > until:
                 raise SurecutError(
                     f"the {dead or 'processes'} did not start; {self.last_problem or 'is there memory?'}"
                 )
+        starting.join()
 
     def stop(self) -> None:
         """Ends the run; from any thread or signal handler."""
@@ -281,6 +290,9 @@ class Stream:
     def _worked(self, worked: Worked) -> None:
         self._count("looking_cpu_us", round(1e6 * worked.cpu_s))
         self._count("left_out", worked.left_out)
+        self._count("thinned", worked.thinned)
+        for topic in worked.unreadable:
+            self._tally.add("malformed", topic)
         if worked.problem is not None:
             self._count("refused_by_front_ends")
             self.last_problem = worked.problem
@@ -306,7 +318,11 @@ class Stream:
             self._finished.set()
 
     def _publish(self, followed: Followed | None) -> None:
-        own = {"dropped": self._queue.dropped_by_topic(), "stamp_outlier": self._order.strays()}
+        own = {
+            "dropped": self._queue.dropped_by_topic(),
+            "stamp_outlier": self._order.strays(),
+            "malformed": self._tally.by_topic().get("malformed", {}),
+        }
         health = self._situation.health(self._order.unpaired, self._sources, own)
         answer, stamp_ns = self._situation.answer(), self._situation.stamp_ns()
         update = update_of(answer, followed, stamp_ns, self._clock(), health, self._recent_counters(), self.settings)
