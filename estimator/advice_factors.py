@@ -10,7 +10,7 @@ from ..factors.calibration import cal3, intrinsics_prior, rgb_mean, rgb_prior
 from ..factors.links import mount_factor
 from ..factors.noise import gaussian, sigmas
 from ..factors.outline import outline_lines
-from ..factors.pipe import outline_factor, side_of, tangency_covariance
+from ..factors.pipe import outline_factor, tangency_covariance
 from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Board
 from .advice_scene import Surroundings, View
@@ -69,16 +69,14 @@ def edges(scene: Surroundings, pipe: str, point: int, view: View) -> list[Predic
     K = values.atCal3DS2(keys.intrinsics("m_left")).K()
     lines = outline_lines(a, b - a, float(values.atVector(keys.radius(i))[0]), K)
     own = typical_edge(scene)
-    if lines is None or own is None:
+    if lines is None or own is None or not values.exists(keys.inset(i)):
         return []
     px = K @ view.o_T_m.transformTo(values.atPoint3(point))
     found = []
     for line in lines:
         foot = px[:2] / px[2] - float(line @ (px / px[2])) * line[:2]
         noise = gaussian(tangency_covariance(-line, own, foot, K, a, b))
-        side = side_of(-line, K, a, b)
-        if values.exists(keys.inset(i, side)):
-            found.append(Predicted(outline_factor("m_left", -line, noise, view.key, i, side)))
+        found.append(Predicted(outline_factor("m_left", -line, noise, view.key, i)))
     return found
 
 

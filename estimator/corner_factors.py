@@ -16,10 +16,13 @@ from .board_news import GEOMETRY, BoardNews
 from .board_start import inset_sigma_px
 from .graph import Record, State, Update
 from .sheet import PageFactor, Sheet
-from .view_cells import ViewCells, added_covariance
+from .view_cells import LEAST_OWN_SHARE, ViewCells, added_covariance
 
 Float = NDArray[np.float64]
 
+LASTING = 0.5
+"""Share of the common part of a corner's error that stays on the page in all views, whatever their place; the rest is
+another one at each place. Nothing tells: print and paper last, what the sampling by pixels does to an edge does not."""
 STILL_VIEWS = 40
 """Views of a board from one place after which further ones are left out: they would count one part in so many."""
 
@@ -85,7 +88,7 @@ class CornerFactors:
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
         """A corner's lasting detection error on the page, from its size in this first view."""
-        lasting = max(self._rig.noise.marker_common_px, sighting.common_px or 0.0)
+        lasting = float(np.sqrt(LASTING)) * max(self._rig.noise.marker_common_px, sighting.common_px or 0.0)
         return lasting * side_m * float(np.sqrt(2.0)) / max(sighting.diagonal_px, 1.0)
 
     def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
@@ -101,4 +104,7 @@ class CornerFactors:
             self._news.refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
             return None
         least = self._rig.noise.marker_common_px
-        return added_covariance(corner_covariance(sighting, least), max(least, sighting.common_px or 0.0), cells.views)
+        common = max(least, sighting.common_px or 0.0)
+        total = corner_covariance(sighting, least)
+        on_page = min(LASTING * common**2 / float(np.einsum("kii->k", total).mean() / 2), 1.0 - LEAST_OWN_SHARE)
+        return added_covariance((1.0 - on_page) * total, float(np.sqrt(1.0 - LASTING)) * common, cells.views)

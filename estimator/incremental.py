@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import gtsam
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
+from .marginal import FAMILY, GaussianPrior, gaussian_of, joint_of, marginal, renamed, without
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -28,7 +29,7 @@ _THRESHOLDS = {
     "v": [2e-4] * 3,
     "h": [1e-5, 1e-4],
     "r": [1e-4],
-    "w": [0.01],
+    "w": [1e-4],
     "k": [0.01, 0.01, 1.0, 0.01, 0.01, 1e-4, 1e-4, 1e-4, 1e-4],
     "d": [2e-4, 2e-4],
     "g": [1e-5, 1e-5, 1e-4],
@@ -40,6 +41,9 @@ of a batch solution; `settle` makes up for what is left at the end."""
 
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
+
+MOVED_ROUNDS = 3
+"""Steps after a part of the map was moved."""
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
@@ -73,6 +77,7 @@ class Incremental:
         self._slots: list[int | None] = []
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
+        self._relocated = False
         self.log = FactorLog()
         self.dropped: list[int] = []
         """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
@@ -92,6 +97,11 @@ class Incremental:
         first = self._isam.getFactorsUnsafe().size()
         self.log.append(update)
         self.log.off.update(removed)
+        if self._relocated:
+            self._relocated = False
+            self._values.insert(update.values)
+            self._begin(self._values)
+            return self.settle(MOVED_ROUNDS)
         try:
             with determined():
                 self._isam.update(graph, update.values, slots)
@@ -147,7 +157,7 @@ class Incremental:
             values = optimiser.optimize()
             self._isam = gtsam.ISAM2(_parameters("QR"))
             self._isam.update(graph, values)
-        self._values = self._isam.calculateEstimate()
+            self._values = self._isam.calculateEstimate()
 
     def values(self) -> gtsam.Values:
         """The estimate over the factors of the log."""
@@ -215,8 +225,17 @@ class Incremental:
         except Undetermined:
             self._restart()
             return
-        self._slots = list(range(len(self.log.factors)))
+        places = count()
+        self._slots = [None if i in self.log.off else next(places) for i in range(len(self.log.factors))]
         self._values = self._isam.calculateEstimate()
+
+    def relocate(self, values: gtsam.Values) -> gtsam.Values:
+        """Values that no step would reach, because a part of the map has been found to lie elsewhere.
+
+        The next update brings what holds it there; the solver begins anew with that.
+        """
+        self._values, self._relocated = values, True
+        return gtsam.Values(values)
 
     def settle(self, rounds: int) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.
@@ -225,22 +244,48 @@ class Incremental:
         up to a fifth of a sigma, is made up for here. That takes a fraction of the time that relinearising in place
         takes, because the elimination is ordered for the whole graph.
         """
-        graph = self.log.graph()
         for _ in range(rounds):
-            before = graph.error(self._values)
+            before, dropped = self.log.graph().error(self._values), len(self.dropped)
             self._begin(self._values)
-            if before - graph.error(self._values) < SETTLED:
+            # a landmark that was given up took its factors along: another graph, and no error to compare with
+            if len(self.dropped) == dropped and before - self.log.graph().error(self._values) < SETTLED:
                 break
         return gtsam.Values(self._values)
 
-    def joint_covariance(self, keys: Sequence[int]) -> Float:
-        """Joint covariance of some variables, in the order of `keys`."""
-        joint = gaussian_of(self.log.graph(), self._values, keys)
-        covariance = np.linalg.inv(joint.H)
+    def joint_covariance(self, wanted: Sequence[int]) -> Float:
+        """Joint covariance of some variables, in the order of `wanted`.
+
+        Raises:
+            ObservabilityError: one of them is not determined, or another variable that is no landmark's.
+        """
+        joint = self._joint_of(wanted)
+        try:
+            covariance = np.linalg.inv(joint.H)
+        except np.linalg.LinAlgError as error:
+            weakest = int(np.abs(np.linalg.eigh(joint.H)[1][:, 0]).argmax())
+            raise Undetermined(int(np.repeat(joint.keys, joint.widths)[weakest])) from error
         ends = np.cumsum(joint.widths)
         columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
-        chosen = np.concatenate([columns[key] for key in keys])
+        chosen = np.concatenate([columns[key] for key in wanted])
         return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
+
+    def _joint_of(self, wanted: Sequence[int]) -> GaussianPrior:
+        """Landmarks that nothing determines at this linearisation say nothing: they are passed over."""
+        graph = self.log.graph()
+        for _ in range(MOST_DROPPED):
+            try:
+                with determined():
+                    return gaussian_of(graph, self._values, wanted)
+            except Undetermined as error:
+                if keys.kind(error.key) != "l" or error.key in wanted:
+                    raise
+                lost, rest = error.key, gtsam.NonlinearFactorGraph()
+                for factor in (graph.at(i) for i in range(graph.size())):
+                    if lost not in factor.keys():
+                        rest.add(factor)
+                graph = rest
+        with determined():
+            return gaussian_of(graph, self._values, wanted)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:

@@ -14,7 +14,7 @@ from ..factors.links import mount_pose, weak_pose_prior
 from ..factors.measurements import CloudFrame, Event
 from ..factors.noise import pose_sigmas, robust, sigmas
 from ..frontends.cloud.associate import associate
-from ..frontends.cloud.noise import SMOOTH_SHARE
+from ..frontends.cloud.noise import SMOOTH_RAD, SMOOTH_SHARE
 from ..frontends.cloud.point_registration import register_points
 from .agreement import ERROR_SIGMA, TOLD_SIGMA, cylinder_event, cylinder_test, cylinder_tests
 from .consistency import PriorTest
@@ -29,8 +29,6 @@ from .surfaces import SAME_SIDE_COSINE
 
 Float = NDArray[np.float64]
 
-CELL_RAD = np.deg2rad(15.0)
-"""Part of the view over which a depth camera's smooth distortion counts as one error."""
 SAME_PIPE_SIGMA = 4.0
 WEAK_SIGMA = 0.3
 """Sigma of {b} (rad, or m) beyond which the cloud tells nothing about a mount in that direction."""
@@ -216,7 +214,7 @@ def _planes(
     facing = (matches.normal * towards).sum(axis=1) > SAME_SIDE_COSINE * np.linalg.norm(towards, axis=1)
     rows, point, normal = matches.landmark[facing], matches.point_m[facing], matches.normal[facing]
     sigma2 = (matches.sigma_m**2 + matches.bias_m**2)[facing]
-    cells = np.floor(point[:, :2] / point[:, 2:] / np.tan(CELL_RAD)).astype(int)
+    cells = np.floor(point[:, :2] / point[:, 2:] / np.tan(SMOOTH_RAD)).astype(int)
     _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     shared = SMOOTH_SHARE * np.abs((normal * point).sum(axis=1))
     sigma = np.sqrt(sigma2 + count[cell.ravel()] * shared**2)

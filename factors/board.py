@@ -18,8 +18,8 @@ Float = NDArray[np.float64]
 
 DIRECTIONS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 """Corners 0..3 in units of half the side."""
-CORNER_PRINT_SIGMA_M = 5e-5
-"""Raggedness of one printed corner: about one dot of a 600 dpi print."""
+CORNER_PRINT_SIGMA_M = 1.2e-5
+"""Raggedness of one printed corner: rounding to the dots of a 600 dpi print, 42 um / sqrt(12)."""
 
 LOOSE_SIGMAS = np.array([0.1, 0.1, 0.5])
 """Sigmas of shift (m) and turn (rad) of a marker that has come off."""

@@ -13,7 +13,7 @@ _WORDS = {
     "u": "pipe axis, first point of pipe {}",
     "v": "pipe axis, second point of pipe {}",
     "r": "radius of pipe {}",
-    "w": "how far the visible edges of a pipe lie inside its outline, {}",
+    "w": "how far the visible edges of pipe {} lie inside its outline",
     "k": "intrinsics of camera {}",
     "e": "camera extrinsics {}",
     "g": "centre and focal length of the Kinect's depth camera",
@@ -79,9 +79,9 @@ def radius(pipe: int) -> int:
     return gtsam.symbol("r", pipe)
 
 
-def inset(pipe: int, side: int) -> int:
-    """How far the visible edges of a side (0, 1) of a pipe lie inside its outline [px]: Vector1."""
-    return gtsam.symbol("w", 2 * pipe + side)
+def inset(pipe: int) -> int:
+    """How far the visible edges of a pipe lie inside its outline [m]: Vector1."""
+    return gtsam.symbol("w", pipe)
 
 
 CAMERA_INDEX = {"m_left": 0, "m_right": 1, "b_rgb": 2}

@@ -76,18 +76,8 @@ def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float
     return G @ covariance @ G.T + np.eye(2) * 1e-10
 
 
-def side_of(line: Float, K: Float, a: Float, b: Float) -> int:
-    """Which side of the pipe an edge is on, 0 or 1, the same in every view of its axis from a to b.
-
-    Args:
-        line: shape (3,), oriented so that the axis lies on the positive side.
-        a, b: shape (3,), the axis points in the camera frame.
-    """
-    return int(float((K.T @ line) @ np.cross(b - a, a + b)) > 0.0)
-
-
-def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int, side: int) -> gtsam.CustomFactor:
-    """One edge of a pipe in one image. It lies inside the true outline by the inset of its side, in pixels.
+def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
+    """One edge of a pipe in one image. It lies inside the true outline by the pipe's inset.
 
     Args:
         camera: `m_left`, `m_right` or `b_rgb`.
@@ -95,10 +85,9 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int,
         noise: of the residual (2,), see `tangency_covariance`.
         pose: key of `o_T_m` or `o_T_b`.
         pipe: index of the pipe.
-        side: see `side_of`.
     """
     variables = [pose, keys.intrinsics(camera), keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
-    variables.append(keys.inset(pipe, side))
+    variables.append(keys.inset(pipe))
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
@@ -107,9 +96,8 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int,
         c_T_s = values.atPose3(variables[6]) if len(variables) == 7 else None
         K = values.atCal3DS2(variables[1]).K()
         seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
-        radius = float(values.atVector(variables[4])[0])
-        true = line + np.array([0.0, 0.0, float(values.atVector(variables[5])[0])])
-        residual, d_shape, d_K = tangency(true, K, seen[0][0], seen[1][0], radius)
+        visible = float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible)
         if jacobians is not None:
             d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
             jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
@@ -118,20 +106,12 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int,
             jacobians[2] = d_a @ seen[0][2]
             jacobians[3] = d_b @ seen[1][2]
             jacobians[4] = d_shape[:, 6:]
-            jacobians[5] = _by_inset(true, K, seen[0][0], seen[1][0])
+            jacobians[5] = -d_shape[:, 6:]
             if c_T_s is not None:
                 jacobians[6] = d_a @ seen[0][3] + d_b @ seen[1][3]
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
-
-
-def _by_inset(line: Float, K: Float, a: Float, b: Float) -> Float:
-    """Derivative (2, 1) of `tangency`'s residual by the line's third component."""
-    normals, lengths = line_planes(line[None], K)
-    points = np.stack([a, b])
-    across = (points - np.outer(points @ normals[0], normals[0])) / lengths[0]
-    return across[:, 2:]
 
 
 def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:
@@ -178,9 +158,9 @@ def radius_prior(pipe: int, radius_m: float, sigma_m: float) -> gtsam.NonlinearF
     return gtsam.PriorFactorVector(keys.radius(pipe), np.array([radius_m]), sigmas([sigma_m]))
 
 
-def inset_prior(pipe: int, side: int, sigma_px: float) -> gtsam.NonlinearFactor:
-    """What is known of an inset before the edges are compared from near and far."""
-    return gtsam.PriorFactorVector(keys.inset(pipe, side), np.zeros(1), sigmas([sigma_px]))
+def inset_prior(pipe: int, sigma_m: float) -> gtsam.NonlinearFactor:
+    """What is known of an inset: images alone cannot tell it from a thinner pipe."""
+    return gtsam.PriorFactorVector(keys.inset(pipe), np.zeros(1), sigmas([sigma_m]))
 
 
 def across_axis(direction: Float) -> Float:

@@ -151,9 +151,9 @@ class Noise(Section):
 
     marker_message_sigma_px: Positive = 0.3
     """Corners that arrive as messages, with no image to judge them by."""
-    marker_common_px: NonNegative = 0.03
-    """Part of a corner's error that is the same in views from the same place, at least: 0.03 px is what fits to
-    rendered pages of many sizes leave beyond the noise of their pixels. A front end may know of more."""
+    marker_common_px: NonNegative = 0.005
+    """Part of a corner's error that is the same in views from the same place, at least: what the corner fit leaves on
+    images without noise. A front end that sees more of it in the pixels says so with each sighting."""
     pick_floor_px: NonNegative = 0.3
 
 

@@ -129,26 +129,26 @@ def _sharpened(
     """
     least = float(np.sqrt(chi2_isf(FALSE_ALARM, 2)))
     fit = fit_board(corners, camera, pose, side_m)
-    norms, limit = _norms(corners, fit), least
+    norms = _norms(corners, fit)
     scale = float(norms.max(initial=0.0))
     while np.isfinite(scale) and scale > least:
         weights = (scale**2 / (scale**2 + norms**2)) ** 2
         fit = fit_board(_weighted(corners, weights), camera, pose, side_m, side_free)
         pose, side_m = fit.camera_T_f, float(fit.extra[0]) if side_free else side_m
         norms, scale = _norms(corners, fit), scale / 2
-    before = None
+    limit, before = least, np.zeros(len(norms), dtype=bool)
     for _ in range(ROUNDS):
         limit = least * float(np.sqrt(max(1.0, np.median(norms**2) / MEDIAN_CHI2)))
         good = norms < limit
-        if good.sum() < FEWEST_CORNERS or (before is not None and (good == before).all()):
+        if good.sum() < FEWEST_CORNERS:
+            return None
+        if (good == before).all():
             break
         before = good
         fit = fit_board(_weighted(corners, np.where(good, 1.0, 1e-12)), camera, pose, side_m, side_free)
         pose, side_m = fit.camera_T_f, float(fit.extra[0]) if side_free else side_m
         norms = _norms(corners, fit)
-    if before is None or not np.isfinite(norms).all():
-        return None
-    return _Majority(fit, norms, limit)
+    return _Majority(fit, norms, limit) if np.isfinite(norms).all() else None
 
 
 def _weighted(corners: BoardCorners, weights: Float) -> BoardCorners:

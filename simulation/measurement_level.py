@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..estimator.baseline import ClickedPoint
-from ..estimator.pipes import INSET_SIGMA_PX
+from ..estimator.pipes import INSET_SHARE
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
@@ -120,17 +120,15 @@ def _build_world(scenario: Scenario, rng: np.random.Generator, outlier_rng: np.r
         stamps_ns=stamps_ns,
         place_stamps_ns=tuple(stamps_ns[i] for i in nearest),
         points_w=_named_points(scenario, scene, rng),
-        insets_px=_insets(scenario, rng),
+        inset=_inset(scenario, rng),
         rng=rng,
         outlier_rng=outlier_rng,
     )
 
 
-def _insets(scenario: Scenario, rng: np.random.Generator) -> Float:
-    """What the pipe's edges share, shape (2,); from a stream of its own, so that nothing else is drawn anew."""
-    if not scenario.faults:
-        return np.zeros(2)
-    return rng.spawn(1)[0].normal(0.0, INSET_SIGMA_PX, 2) * scenario.noise_factors.outlines
+def _inset(scenario: Scenario, rng: np.random.Generator) -> float:
+    """What the pipe's edges share; from a stream of its own, so that nothing else is drawn anew."""
+    return float(rng.spawn(1)[0].normal(0.0, INSET_SHARE)) if scenario.faults else 0.0
 
 
 def _named_points(scenario: Scenario, scene: Scene, rng: np.random.Generator) -> dict[str, Float]:
@@ -173,7 +171,9 @@ def _truth(world: World) -> Truth:
         o_T_b=o_T_w @ world.scene.w_T_b,
         o_T_f={name: o_T_w @ w_T_f for name, w_T_f in world.w_T_f.items()},
         points_b_m={name: transform(b_T_w, point) for name, point in world.points_w.items()},
-        pipe=TruePipe(transform(b_T_w, pipe.base), b_T_w[:3, :3] @ pipe.axis, pipe.radius_m),
+        pipe=TruePipe(
+            transform(b_T_w, pipe.base), b_T_w[:3, :3] @ pipe.axis, pipe.radius_m, world.inset * pipe.radius_m
+        ),
         rig=world.true,
     )
 

@@ -157,7 +157,8 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
     """The two true edges, each shifted and turned by noise about its foot near the click."""
     camera, rng, pipe = world.true.cameras["m_left"], world.rng, world.scene.pipe
     m_T_w = invert(w_T_m)
-    lines = outline_lines(transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis, pipe.radius_m, camera.K)
+    visible_m = pipe.radius_m * (1.0 - world.inset)
+    lines = outline_lines(transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis, visible_m, camera.K)
     if lines is None:
         return None
     half_px = 0.25 * camera.height
@@ -168,7 +169,7 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
         feet[i] = pick_px - (line @ np.r_[pick_px, 1.0]) * line[:2]
         spread = np.array([np.hypot(sigmas[0], EDGE_FLOOR_PX), sigmas[1]])
         shift, turn = rng.normal(0.0, spread * world.scenario.noise_factors.outlines)
-        shift += world.insets_px[i] + _edge_outlier_px(world)
+        shift += _edge_outlier_px(world)
         noisy[i] = _moved_line(line, feet[i], shift, turn)
         along = np.array([-noisy[i, 1], noisy[i, 0]])
         extents[i] = feet[i] + np.outer([-half_px, half_px], along)

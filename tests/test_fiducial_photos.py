@@ -67,7 +67,8 @@ def test_golden_corners_of_opencv(name):
 
 
 def test_halves_of_the_pixels_agree_within_their_covariances(monkeypatch):
-    """Real noise, JPEG, careless resizing: corners from either half of a marker's pixels share nothing of it."""
+    """Real noise, JPEG, careless resizing: corners from either half of a marker's pixels share nothing of it. What they
+    do share are edges that are off as a whole; the covariances hold that too, so the halves are nearer than those."""
     folder, golden = photographs()
     whole = pixel_choice._distinct
     given = yaml.safe_load((folder / "ubiquity" / "camera.yaml").read_text())
@@ -90,7 +91,7 @@ def test_halves_of_the_pixels_agree_within_their_covariances(monkeypatch):
             apart, covariance = one.corners_px - other.corners_px, one.covariance_px2 + other.covariance_px2
             squares.append(np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart).mean() / 2)
     assert len(squares) > 75
-    assert 0.6 < np.mean(squares) < 1.6
+    assert 0.15 < np.mean(squares) < 1.0
 
 
 def test_ubiquity_corners_and_reference_pose():

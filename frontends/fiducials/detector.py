@@ -20,14 +20,13 @@ Float = NDArray[np.float64]
 
 CORNER_FLOOR_PX = 0.004
 """What blur, sampling and the model leave on a corner where there is no noise at all (docs/corners.md)."""
-COMMON_PX = 0.01
-"""Error that two images from one place have in common, in rendered images of all sizes (docs/corners.md)."""
 _MIN_CORRELATION = 0.80
 """Pixels with the fitted pattern, for a marker that was read."""
 _MIN_CORRELATION_PREDICTED = 0.90
 """The same for one that was only expected there."""
-_MAX_CORRELATION_LOSS = 0.05
-"""From one image to the next, for a marker that is followed and not read again."""
+_UNEXPLAINED, _UNEXPLAINED_GROWTH = 0.02, 4.0
+"""Share of the pixels' variance that the pattern may leave over, or how many times what it left in the last image, for
+a marker that is followed and not read again."""
 _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
@@ -128,7 +127,8 @@ class MarkerFrontEnd:
             warm = Warm.together([m.warm for m in group])
             fit = fit_patterns(grey, ideal, patterns, self._positions, raw[index], warm)
             for k, m in enumerate(group):
-                limit = max(_MIN_CORRELATION, m.correlation - _MAX_CORRELATION_LOSS)
+                unexplained = max(_UNEXPLAINED_GROWTH * (1.0 - m.correlation**2), _UNEXPLAINED)
+                limit = max(_MIN_CORRELATION, float(np.sqrt(max(1.0 - unexplained, 0.0))))
                 result.append(_judged(candidates[k], ideal[k], fit, k, cells, limit))
         if any(f.problem is not None for f in result):
             return None
@@ -223,7 +223,7 @@ class MarkerFrontEnd:
             fitted.corners,
             blocks + CORNER_FLOOR_PX**2 * np.eye(2),
             distort(self._camera, fitted.corners),
-            float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2 + COMMON_PX**2)),
+            float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2)),
         )
 
     def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:

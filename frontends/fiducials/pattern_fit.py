@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .edge_errors import edge_errors
 from .pattern_model import PatternModel, corner_basis, homography, pattern_model, second_difference
 from .pixel_choice import Choice, Pixels, choose_pixels, surroundings
 from .pixel_noise import pixel_noise
@@ -42,8 +43,10 @@ _TONE, _LIGHT, _UNKNOWNS = 11, 12, 22
 """Places among the unknowns: eight corner coordinates, three of the blur, the tone, ten of the light."""
 _TONE_RANGE = (-0.75, 3.0)
 """More bent than any camera; the same either way."""
-_COARSE_PX, _FINE_PX = 0.12, 0.012
+_COARSE_PX, _FINE_PX = 0.12, 0.04
 """Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
+_UNSETTLED = 0.15
+"""What further steps would add to the last one, as a share of it: the most that was measured."""
 _COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
 """Edges may be that far off, beside the noise, before their pixels lose weight, in either stage."""
 _ROUNDING = np.sqrt(1.0 / 12.0)
@@ -175,7 +178,17 @@ class _Solved:
     residual: Single
     """After the step."""
     weight: Single
-    jacobian: Single
+    columns: Single
+    """Jacobian by all unknowns, the corners first."""
+    shifts: tuple[Single, Single]
+    """Change of the grey values by the shift of each grid line."""
+    place: Single
+    """Of the pixels in the marker, from its middle."""
+
+    @property
+    def jacobian(self) -> Single:
+        """By the corners."""
+        return self.columns[..., :8]
 
 
 def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bool) -> tuple[_State, _Solved]:
@@ -188,7 +201,9 @@ def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bo
         np.zeros((m, _UNKNOWNS, _UNKNOWNS)),
         np.zeros((m, n), np.float32),
         np.zeros((m, n), np.float32),
-        np.zeros((m, n, 8), np.float32),
+        np.zeros((m, n, _UNKNOWNS), np.float32),
+        (np.zeros((m, n, len(lines)), np.float32), np.zeros((m, n, len(lines)), np.float32)),
+        np.zeros((m, n, 2), np.float32),
     )
     forgiven = _COARSE_FORGIVEN_PX if coarse else _FORGIVEN_PX
     active = np.arange(m)
@@ -202,8 +217,10 @@ def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bo
         blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
         tone[active] = np.clip(tone[active] + one.step[:, _TONE], *_TONE_RANGE)
         light[active] = one.step[:, _LIGHT:]
-        for name in ("step", "inverse", "residual", "weight", "jacobian"):
+        for name in ("step", "inverse", "residual", "weight", "columns", "place"):
             getattr(solved, name)[active] = getattr(one, name)
+        for all_shifts, shifts in zip(solved.shifts, one.shifts, strict=True):
+            all_shifts[active] = shifts
         active = active[largest > (_COARSE_PX if coarse else _FINE_PX)]
         if not len(active):
             break
@@ -244,7 +261,8 @@ def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px:
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
     step[:, _LIGHT:] += light
-    return _Solved(step, inverse, after, weight, columns[..., :8])
+    shifts = gain[..., None] * model.by_lines[0], gain[..., None] * model.by_lines[1]
+    return _Solved(step, inverse, after, weight, columns, shifts, np.stack([u, v], -1))
 
 
 def _by_corners(H: Float, model: PatternModel, xy: Single, gain: Single) -> Single:
@@ -310,10 +328,12 @@ def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> Pa
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
+    edges = edge_errors(solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place)
     factor = _hang_together(solved, pixels, weight) * _gathered(solved, weight, variance)
     last_step = np.abs(solved.step[:, :8]).max(1)
-    covariance = solved.inverse[:, :8, :8] * (variance * factor)[:, None, None]
-    covariance += (last_step**2)[:, None, None] * np.eye(8)
+    by_noise = solved.inverse[:, :8, :8] * (edges.noise_variance * factor)[:, None, None]
+    covariance = by_noise + edges.variance_px2 * edges.spread
+    covariance += ((_UNSETTLED * last_step) ** 2)[:, None, None] * np.eye(8)
     return PatternFit(
         state.corners + pixels.origin[:, None],
         covariance,
@@ -324,9 +344,15 @@ def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> Pa
         _share(solved, pixels),
         last_step,
         factor,
-        np.clip(1.0 - (noise**2 + _ROUNDING**2) / (variance * factor), 0.0, 1.0),
+        _structure(solved, covariance, np.minimum(noise**2 + _ROUNDING**2, edges.noise_variance * factor)),
         Warm(state.blur, state.tone, light),
     )
+
+
+def _structure(solved: _Solved, covariance: Float, noise: Float) -> Float:
+    """Share of the covariances that is not the noise of the pixels (a variance, shape (m,))."""
+    by_noise = noise * np.einsum("mkk->m", solved.inverse[:, :8, :8])
+    return np.clip(1.0 - by_noise / np.einsum("mkk->m", covariance), 0.0, 1.0)
 
 
 def _share(solved: _Solved, pixels: Pixels) -> Float:

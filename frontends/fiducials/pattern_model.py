@@ -84,6 +84,8 @@ class PatternModel:
     """By the blur's variances xx, yy and covariance xy in the image, shape (m, n, 3)."""
     surround: Single
     """How much of what each pixel sees lies more than a cell outside: left, right, below, above; shape (m, n, 4)."""
+    by_lines: tuple[Single, Single]
+    """By a shift of each grid line across itself, in pixels: of those of constant a, then of b; shapes (m, n, k)."""
 
 
 def pattern_model(H: Float, xy: Single, blur: Float, D: Single, lines: Single) -> PatternModel:
@@ -109,7 +111,13 @@ def pattern_model(H: Float, xy: Single, blur: Float, D: Single, lines: Single) -
     by_blur[..., 1] = 0.5 * (aa * y_a**2 + bb * y_b**2) + ab * y_a * y_b
     by_blur[..., 2] = aa * x_a * y_a + bb * x_b * y_b + ab * (x_a * y_b + x_b * y_a)
     surround = np.stack([1.0 - fa[..., 0], fa[..., -1], 1.0 - fb[..., 0], fb[..., -1]], -1)
-    return PatternModel(a, b, T, gradient, by_blur, surround)
+    across = -over_a * _length(grad_a), -over_b * _length(grad_b)
+    by_lines = na * (fb @ D.transpose(0, 2, 1)) * across[0][..., None], nb * fa_D * across[1][..., None]
+    return PatternModel(a, b, T, gradient, by_blur, surround, by_lines)
+
+
+def _length(vectors: Single) -> Single:
+    return np.sqrt(np.einsum("mni,mni->mn", vectors, vectors))
 
 
 def _smeared(blur: Float, gradient: Single) -> Single:

@@ -130,7 +130,7 @@ def _through(
         r1, r2 = np.abs(s) * np.sqrt(a), np.abs(t) * np.sqrt(c)
     radius = 0.5 * (r1 + r2)
     good = np.isfinite(radius) & (radius > limits[0]) & (radius < limits[1]) & (np.sign(s) == np.sign(-t) * np.sign(-b))
-    good &= np.abs(r1 - r2) < 0.5 * radius
+    good[good] &= np.abs(r1[good] - r2[good]) < 0.5 * radius[good]
     return centre, radius, good
 
 

@@ -16,10 +16,10 @@ from .motion import Motion, estimate_motion
 from .noise import NoiseModel
 from .observer import Keyview, Observer, expected_depth
 from .pair import StereoPair, prepare
-from .places import PlaceStore, Relocalisation
+from .places import ALIKE, PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
-from .sighting import Sighting, nothing_seen
+from .sighting import Sighting, blind_frame, nothing_seen
 from .tracks import Int, Tracks, no_tracks
 from .vertical import VerticalCorrection
 
@@ -27,6 +27,8 @@ Bool = NDArray[np.bool_]
 
 _FADING = 0.7
 """Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
+_STRAYED_ALIKE = 0.4
+"""Correlation of thumbnails from which on a place is worth a look after the tracks have broken."""
 _CALM_PX = 1.5
 """Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
@@ -64,6 +66,8 @@ class StereoFrontEnd:
         self._velocity = np.zeros(6)
         self._surprise_px = np.inf
         """By how much the last flow differed from what constant velocity foretold."""
+        self._strayed_ns: int | None = None
+        """When the tracks broke without a known place having been found since."""
 
     @property
     def chain_T_keyframe(self) -> Float:
@@ -322,8 +326,10 @@ class StereoFrontEnd:
         The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
         """
         nothing = no_tracks(self._observer.grid), nothing_seen()
-        before_ns = view.pair.stamp_ns - self.settings.loop_ns
-        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation)
+        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
+        if self._strayed_ns is not None:
+            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
+        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation, alike)
         if found is None:
             return nothing
         drifted = self._chain_T_keyframe
@@ -333,6 +339,7 @@ class StereoFrontEnd:
             self._chain_T_keyframe = drifted
             return nothing
         self._correct_chain(correction)
+        self._strayed_ns = None
         return tracks, seen
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
@@ -367,7 +374,10 @@ class StereoFrontEnd:
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
         found = self.places.find(pair.left, self.settings.min_relocalisation)
+        if not found and self._strayed_ns is None:
+            self._strayed_ns = self._last.stamp_ns if self._last is not None else None
         if found:
+            self._strayed_ns = None
             chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
             last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
         self._velocity = _FADING * self._velocity
@@ -383,21 +393,4 @@ class StereoFrontEnd:
         if np.isfinite(frame.right_px[:, 0]).sum() >= self.settings.min_inliers:
             return frame
         self._tracks = no_tracks(self._observer.grid)
-        return _blind(pair.stamp_ns, last_T_this)
-
-
-def _blind(stamp_ns: int, last_T_this: Float) -> StereoFrame:
-    """A frame that shows nothing."""
-    seen = nothing_seen()
-    return StereoFrame(
-        stamp_ns=stamp_ns,
-        is_keyframe=False,
-        track_ids=np.zeros(0, dtype=np.int64),
-        left_px=seen.left_px,
-        left_covariance_px2=seen.left_covariance,
-        right_px=seen.right_px,
-        right_covariance_px2=seen.right_covariance,
-        last_T_this=last_T_this,
-        motion_inliers=0,
-        lost=True,
-    )
+        return blind_frame(pair.stamp_ns, last_T_this)

@@ -10,7 +10,7 @@ from .stereo_motion import MEDIAN_4
 
 Bool = NDArray[np.bool_]
 
-_FLOOR_PX = 0.06
+_FLOOR_PX = 0.04
 """What remains on sharp noise-free views: sampling and slant; scaled by the log's residuals like the rest."""
 _REFERENCE = 1.5
 _RATE = 0.4

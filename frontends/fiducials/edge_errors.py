@@ -1,0 +1,88 @@
+"""How far the printed edges lie from where the model has them, each for itself, by what the fit leaves over.
+
+Noise of pixels is one thing, an edge that is off as a whole another: pixels that see only a part of their area, paper
+that is not flat, ink that ran, a picture made smaller without care. Such an error is common to all pixels of an edge,
+so more pixels do not help against it. It is told from the noise as a component of variance: every grid line of the
+pattern may be shifted across itself and turned, with one variance for all markers of the image,
+
+    r = M (noise + G d),    d ~ N(0, s^2),    M: what is left after the fit,    G: a grid line's shift or turn
+
+and the quadratic form u' D^-1 u of the scores u = G' W r has the expectation s^2 tr(D^-1 S S) + sigma^2 tr(D^-1 S) with
+S = G' W M G (estimation of variance components: Rao, "Estimation of variance and covariance components", 1971).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# NumPy's own annotations widen every sum and product: double and single precision are told apart for the reader
+Float = NDArray[Any]
+Single = NDArray[Any]
+
+_TURN = np.float32(np.sqrt(6.0))
+"""A turn about the middle of a line, of half the mean square along it that a shift has: a line that errs as a whole has
+no turn, one that errs piece by piece as much of it as of a shift."""
+_LEAST_SHARE = 1e-3
+"""Lines that are seen less than this share of the best one tell nothing."""
+_RANK = 1e-4
+_ROUNDING2 = 1.0 / 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeErrors:
+    """Of the m markers of one image."""
+
+    variance_px2: float
+    """Of one grid line's place: the same for all."""
+    noise_variance: Float
+    """Of a pixel, in grey values, without what the lines explain; shape (m,)."""
+    spread: Float
+    """Covariance of the eight corner coordinates by lines that err by one pixel, shape (m, 8, 8)."""
+
+
+def edge_errors(
+    columns: Single, inverse: Float, residual: Single, weight: Single, shifts: tuple[Single, Single], place: Single
+) -> EdgeErrors:
+    """Variance components of m fits.
+
+    Args:
+        columns: Jacobian of the fit, the corners first, shape (m, n, k).
+        inverse: of its normal matrix, shape (m, k, k).
+        residual: shape (m, n), of the fit.
+        weight: shape (m, n).
+        shifts: change of the grey values by a shift of each grid line, pixels, along either axis, shapes (m, n, l).
+        place: (a - 1/2, b - 1/2) of each pixel in the marker, shape (m, n, 2).
+    """
+    along = place[..., 1, None] * _TURN, place[..., 0, None] * _TURN
+    G = np.concatenate([*shifts, shifts[0] * along[0], shifts[1] * along[1]], -1)
+    weighted = (G * weight[..., None]).transpose(0, 2, 1)
+    strength = (weighted @ G).astype(float)
+    cross = (weighted @ columns).astype(float)
+    through = inverse @ cross.transpose(0, 2, 1)
+    S = strength - cross @ through
+    u = (weighted @ residual[..., None])[..., 0].astype(float)
+    D = np.einsum("mll->ml", strength)
+    over = np.where(D > _LEAST_SHARE * D.max(1, keepdims=True), 1.0 / np.maximum(D, 1e-12), 0.0)
+    seen = over > 0
+    S = S * seen[:, :, None] * seen[:, None, :]
+    noise = _noise(S, u * seen, D, over, residual, weight, columns.shape[-1])
+    by_noise = np.einsum("mll,ml->m", S, over)
+    by_lines = np.einsum("mlk,mlk,ml->m", S, S, over)
+    off = ((u**2 * over).sum(1) - noise * by_noise) / noise
+    variance = max(float(off.sum() / max((by_lines / noise).sum(), 1e-12)), 0.0)
+    K = through[:, :8] * seen[:, None, :]
+    return EdgeErrors(variance, noise, K @ K.transpose(0, 2, 1))
+
+
+def _noise(S: Float, u: Float, D: Float, over: Float, residual: Single, weight: Single, unknowns: int) -> Float:
+    """Variance of a pixel once every line may be where it likes, shape (m,)."""
+    root = np.sqrt(over)
+    values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
+    told = values > _RANK
+    along = np.einsum("mlk,ml->mk", vectors, u * root)
+    explained = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(1)
+    left = (residual**2 * weight).sum(1) - explained
+    freedom = np.maximum(weight.sum(1) - unknowns - told.sum(1), 1.0)
+    return np.maximum(left / freedom, _ROUNDING2)
