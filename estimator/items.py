@@ -1,7 +1,10 @@
 """What front ends are fed with. It loads no front end: whoever only hands messages on starts quickly."""
 
+from collections.abc import Iterable
+
+from ..factors.errors import LogError
 from ..factors.rig import Rig
-from ..io.messages import Message
+from ..io.messages import DepthBody, ImageBody, Message
 from ..io.pairing import StereoPair
 
 Item = Message | StereoPair
@@ -28,3 +31,18 @@ def plain(message: Message) -> Message:
         return message
     topic = message.topic.removesuffix(COMPRESSED)
     return Message(topic, message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
+
+
+def unreadable(items: Iterable[Item]) -> tuple[str, ...]:
+    """Topics of images whose pixels cannot be decoded."""
+    found = []
+    for item in items:
+        for message in (item.left, item.right) if isinstance(item, StereoPair) else (item,):
+            try:
+                if isinstance(message.body, ImageBody):
+                    message.body.pixels()
+                elif isinstance(message.body, DepthBody):
+                    message.body.depth_m()
+            except LogError:
+                found.append(message.topic)
+    return tuple(found)

@@ -168,10 +168,10 @@ def test_a_turned_patch_fits_beside_its_centre():
     theta = 0.3
     turn = np.eye(4)
     turn[:3, :3] = [[np.cos(theta), 0, np.sin(theta)], [0, 1, 0], [-np.sin(theta), 0, np.cos(theta)]]
-    left, _ = curvatures(np.array([[0.0, 0.0, 2.0]]), turn[None], rig())
+    left, _ = curvatures(np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 2)), turn[None], rig())
     # u / f = tan(phi + theta): half its second derivative over its first.
     assert left[0] == pytest.approx([np.tan(theta) / K[0, 0], 0.0], rel=1e-6, abs=1e-9)
-    assert not np.any(curvatures(np.full((1, 3), np.nan), turn[None], rig()))
+    assert not np.any(curvatures(np.full((1, 3), np.nan), np.zeros((1, 2)), turn[None], rig()))
 
     rng = np.random.default_rng(8)
     waves = list(zip(rng.normal(0, 0.45, (40, 2)), rng.normal(0, 13, 40), rng.uniform(0, 2 * np.pi, 40), strict=True))

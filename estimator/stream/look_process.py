@@ -16,10 +16,12 @@ from ...frontends.undistort import distort
 from ...io.live.interfaces import Outline
 from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
-from ..sensing import Item, Sensing, images
+from ..items import Item, unreadable
+from ..sensing import Sensing, images
 from ..sensors import PairImages
 from .parent import LOOK_NICE, end_with_parent, give_way
 from .settings import StreamSettings
+from .thinning import Thinning
 from .wire import Died, LateClick, Order, Ready, Tracked, Worked
 
 REFUSALS = 1000
@@ -37,7 +39,7 @@ def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: A
         give_way(LOOK_NICE)
     cv2.setNumThreads(1)
     try:
-        loop = LookLoop(rig, settings, graph, out)
+        loop = LookLoop(rig, settings, patient, graph, out)
         out.put(Ready("front ends"))
         while True:
             item = inbox.get()
@@ -48,7 +50,7 @@ def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: A
                 if item.what == "finish":
                     return
                 if item.what == "reset":
-                    loop = LookLoop(rig, settings, graph, out, loop.calibrations)
+                    loop = LookLoop(rig, settings, patient, graph, out, loop.calibrations)
     except Exception:
         out.put(Died("front ends", traceback.format_exc()))
 
@@ -69,11 +71,18 @@ class LookLoop:
     """
 
     def __init__(
-        self, rig: Rig, settings: StreamSettings, graph: Any, out: Any, calibrations: dict[str, Message] | None = None
+        self,
+        rig: Rig,
+        settings: StreamSettings,
+        patient: bool,
+        graph: Any,
+        out: Any,
+        calibrations: dict[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
         self._settings = settings
         self._graph = graph
+        self._thinning = Thinning(graph, settings, patient)
         self._out = out
         self._recent: OrderedDict[int, Recent] = OrderedDict()
         self._newest_ns = 0
@@ -86,7 +95,7 @@ class LookLoop:
         """A group. Whatever is wrong with it is told, and the stream goes on."""
         items = tracked.items
         began = time.process_time()
-        problem, outlines, picks = None, {}, 0
+        problem, bad, outlines, picks = None, (), {}, 0
         stamp_ns = items[0].stamp_ns
         try:
             clicks = [item for item in items if isinstance(item, Message) and _on_mobile(item)]
@@ -96,14 +105,16 @@ class LookLoop:
             else:
                 outlines = self._present(items, tracked.frame)
         except SurecutError as error:
-            problem = " ".join(str(error).split())
-        self._out.put(Worked(outlines, stamp_ns, problem, picks, time.process_time() - began))
+            problem, bad = " ".join(str(error).split()), unreadable(items)
+        cpu_s = time.process_time() - began
+        thinned = self._thinning.taken()
+        self._out.put(Worked(outlines, stamp_ns, problem, picks, cpu_s, unreadable=bad, thinned=thinned))
 
     def _present(self, items: list[Item], frame: StereoFrame | None) -> dict[str, tuple[Outline, ...]]:
         self._note(items)
         sensed = self._sensing.look(items, frame)
         self._remember(sensed.bundle.frame)
-        self._graph.put(sensed)
+        self._thinning.put(sensed)
         del self._sensing.sensors.rejected[:-REFUSALS]
         return self._outlines(sensed.bundle.sightings)
 

@@ -23,6 +23,10 @@ class StreamSettings:
     """Groups that the other front ends may be behind the tracking."""
     graph_ahead: int = 200
     """Stamps that the graph may be behind the front ends."""
+    thin_from: int = 40
+    """Stamps behind from which on the graph gets fewer frames."""
+    thin_ns: int = 500 * MS
+    """Between keyframes that it gets then."""
     recent_ns: int = 15 * S
     """How far back a click may be: pictures of so long are kept."""
     answer_period_ns: int = 400 * MS

@@ -290,6 +290,9 @@ class Stream:
     def _worked(self, worked: Worked) -> None:
         self._count("looking_cpu_us", round(1e6 * worked.cpu_s))
         self._count("left_out", worked.left_out)
+        self._count("thinned", worked.thinned)
+        for topic in worked.unreadable:
+            self._tally.add("malformed", topic)
         if worked.problem is not None:
             self._count("refused_by_front_ends")
             self.last_problem = worked.problem
@@ -315,7 +318,11 @@ class Stream:
             self._finished.set()
 
     def _publish(self, followed: Followed | None) -> None:
-        own = {"dropped": self._queue.dropped_by_topic(), "stamp_outlier": self._order.strays()}
+        own = {
+            "dropped": self._queue.dropped_by_topic(),
+            "stamp_outlier": self._order.strays(),
+            "malformed": self._tally.by_topic().get("malformed", {}),
+        }
         health = self._situation.health(self._order.unpaired, self._sources, own)
         answer, stamp_ns = self._situation.answer(), self._situation.stamp_ns()
         update = update_of(answer, followed, stamp_ns, self._clock(), health, self._recent_counters(), self.settings)

@@ -11,7 +11,8 @@ from ...factors.errors import SurecutError
 from ...factors.rig import Rig
 from ...io.messages import CloudBody, DepthBody, ImageBody, Message
 from ...io.pairing import StereoPair
-from ..sensing import Item, Sensing
+from ..items import Item, unreadable
+from ..sensing import Sensing
 from .parent import end_with_parent
 from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
 
@@ -74,8 +75,11 @@ class TrackLoop:
             motion = frame.last_T_this, frame.is_keyframe, frame.lost, frame.motion_inliers
             self._out.put(Frame(frame.stamp_ns, *motion, taken_ns, time.monotonic_ns(), cpu_s))
         elif problem is not None:
-            self._out.put(Worked({}, 0, problem, 0, cpu_s))
-        self._hand_on(Tracked(items, frame))
+            self._out.put(Worked({}, 0, problem, 0, cpu_s, unreadable=unreadable(items)))
+        if problem is not None:
+            items = [item for item in items if not isinstance(item, StereoPair)]  # it is told once
+        if items:
+            self._hand_on(Tracked(items, frame))
 
     def _hand_on(self, tracked: Tracked) -> None:
         """To the other front ends. Where these are far behind, what is only about surfaces is left out: the pose of

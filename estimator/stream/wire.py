@@ -72,6 +72,10 @@ class Worked:
     """Processor time that it took."""
     left_out: int = 0
     """Images of the machine's camera that were left out, because the front ends are behind."""
+    unreadable: tuple[str, ...] = ()
+    """Topics of images in it that cannot be decoded."""
+    thinned: int = 0
+    """Frames that the graph was spared, see `thinning`."""
 
 
 @dataclass(frozen=True, slots=True)

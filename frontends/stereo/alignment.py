@@ -79,14 +79,16 @@ class Alignment:
     """Shape (n, 2, 2): of `px`, from the patch's structure and the residual, px^2, not yet calibrated."""
     converged: Bool
     """Shape (n,)."""
+    bend: Float
+    """Shape (n, 2, 2): linear part that fits beyond the given one, zero where only the shift is estimated."""
 
     def moved(self, offset: Float) -> "Alignment":
         """The same at places moved by `offset` (n, 2)."""
-        return Alignment(self.px + offset, self.correlation, self.covariance, self.converged)
+        return Alignment(self.px + offset, self.correlation, self.covariance, self.converged, self.bend)
 
     def take(self, index: NDArray[np.intp] | Bool) -> "Alignment":
         """Those at the given indices or of the given mask."""
-        return Alignment(self.px[index], self.correlation[index], self.covariance[index], self.converged[index])
+        return Alignment(*(getattr(self, field.name)[index] for field in fields(Alignment)))
 
 
 class PatchGrid:
@@ -225,6 +227,7 @@ def align(
     n = len(px)
     difference = np.zeros_like(patches.values)
     converged = np.zeros(n, dtype=bool)
+    bend = np.zeros((n, 2, 2))
     index = np.flatnonzero(np.isfinite(guess).all(axis=1))
     now = _Descent(patches, px, linear, grid) if len(index) == n else _Descent(patches, px, linear, grid).take(index)
     for _ in range(iterations):
@@ -232,6 +235,7 @@ def align(
             break
         difference[index] = now.step(image)
         px[index], converged[index] = now.px, now.still
+        bend[index] = now.linear
         # Those that are done go on with the rest until they are many: copies cost more than steps.
         if now.still.mean() > _DONE:
             index = index[~now.still]
@@ -244,7 +248,7 @@ def align(
     moved = np.linalg.norm(px - guess, axis=1)
     with np.errstate(invalid="ignore"):
         converged &= visible & (moved < reach_px)
-    return Alignment(px, correlation, covariance.astype(np.float64), converged)
+    return Alignment(px, correlation, covariance.astype(np.float64), converged, bend)
 
 
 class _Descent:
@@ -257,6 +261,11 @@ class _Descent:
         self._warp = linear
         self.still = np.zeros(len(px), dtype=bool)
         """Which moved less than `_CONVERGED_PX` in the last step."""
+
+    @property
+    def linear(self) -> Float:
+        """Linear parts (n, 2, 2) that have been found."""
+        return self._bend[:, 2:].reshape(-1, 2, 2) if self._grid.affine else np.zeros((len(self.px), 2, 2))
 
     def take(self, chosen: NDArray[np.intp] | Bool) -> "_Descent":
         """Goes on with some of them."""

@@ -27,13 +27,14 @@ def inverse_each(poses: Float) -> Float:
     return out
 
 
-def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) -> tuple[Float, Float]:
+def linear_warps(patch_points: Float, slopes: Float, this_T_patch: Float, rig: StereoGeometry) -> tuple[Float, Float]:
     """Derivatives (n, 2, 2) of the left and the right raw pixels by the reference patch's raw pixels.
 
-    The surface is taken to face the camera that saw the patch. Identity where the point has no depth.
+    Identity where the point has no depth.
 
     Args:
         patch_points: (n, 3), in the left camera that saw the patch; NaN without depth.
+        slopes: (n, 2), relative change of the inverse depth per pixel; zero for a surface that faces the camera.
         this_T_patch: (n, 4, 4), pose of that camera in this left camera.
         rig: nominal geometry.
     """
@@ -43,6 +44,8 @@ def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) 
     moved[:] = points
     moved[1, :, 0] += points[:, 2] / rig.left.fx
     moved[2, :, 1] += points[:, 2] / rig.left.fy
+    moved[1] /= 1.0 + slopes[:, :1]
+    moved[2] /= 1.0 + slopes[:, 1:]
     here = transform_each(this_T_patch, moved)
     warps = []
     for camera, seen in ((rig.left, here), (rig.right, here @ rig.right_T_left[:3, :3].T + rig.right_T_left[:3, 3])):
@@ -55,7 +58,7 @@ def linear_warps(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) 
     return warps[0], warps[1]
 
 
-def curvatures(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) -> tuple[Float, Float]:
+def curvatures(patch_points: Float, slopes: Float, this_T_patch: Float, rig: StereoGeometry) -> tuple[Float, Float]:
     """How much the views of patches are bent beyond their linear warps: c (n, 2) in left and right image, 1/px.
 
     A patch that is turned away is not only stretched but bent: what lies at d in the reference lies at
@@ -64,21 +67,21 @@ def curvatures(patch_points: Float, this_T_patch: Float, rig: StereoGeometry) ->
     would look like another focal length or centre. (The lens's own bend is left out: it is smaller.)
 
     Args:
-        patch_points, this_T_patch, rig: as for `linear_warps`.
+        patch_points, slopes, this_T_patch, rig: as for `linear_warps`.
     """
     known = np.asarray(np.isfinite(patch_points).all(axis=1))
     points = np.where(known[:, None], patch_points, [0.0, 0.0, 1.0])
-    here = transform_each(this_T_patch, points)
-    turns = this_T_patch[:, :3, :3]
     found = []
-    for depth, turn in (
-        (here[:, 2], turns[:, 2]),
-        (here @ rig.right_T_left[2, :3] + rig.right_T_left[2, 3], rig.right_T_left[2, :3] @ turns),
+    for turn, shift in (
+        (this_T_patch[:, 2, :3], this_T_patch[:, 2, 3]),
+        (rig.right_T_left[2, :3] @ this_T_patch[:, :3, :3], this_T_patch[:, :3, 3] @ rig.right_T_left[2, :3]),
     ):
-        ahead = known & (depth > _NEAREST * points[:, 2])
-        ratio = points[:, 2] / np.where(ahead, depth, 1.0)
-        c = -turn[:, :2] * ratio[:, None] / (rig.left.fx, rig.left.fy)
-        found.append(np.where(ahead[:, None], c, 0.0))
+        step = shift + (rig.right_T_left[2, 3] if found else 0.0)
+        # Depth here over depth there, and its derivative by the pixels there.
+        ratio = ((turn * points).sum(axis=1) + step) / points[:, 2]
+        ahead = known & (ratio > _NEAREST)
+        slope = turn[:, :2] / (rig.left.fx, rig.left.fy) + slopes * (step / points[:, 2])[:, None]
+        found.append(np.where(ahead[:, None], -slope / np.where(ahead, ratio, 1.0)[:, None], 0.0))
     return found[0], found[1]
 
 
