@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test check format clean bench campaign
+.PHONY: demo test check format clean bench campaign campaign-measurements campaign-pixels campaign-real
 
 demo: $(READY)
 	$(BIN)/surecut demo
@@ -30,13 +30,27 @@ $(READY): pyproject.toml
 bench: $(READY)
 	OMP_NUM_THREADS=2 $(BIN)/python benchmarks/run.py --gate 2.0
 
-campaign: $(READY)
-	$(BIN)/surecut campaign -o logs/campaign --runs 1000 --jobs 2 --validation docs/validation.md
-	$(BIN)/surecut campaign -o logs/decisions --decisions --runs 200 --jobs 2 --validation docs/validation.md
-	$(BIN)/surecut campaign -o logs/half-noise --scenario half-noise --runs 100 --jobs 2 --validation docs/validation.md
-	$(BIN)/surecut campaign -o logs/outliers --scenario outliers --runs 100 --jobs 2 --validation docs/validation.md
-	$(BIN)/surecut campaign -o logs/validation --scenario validation --runs 300 --jobs 2 \
-		--validation docs/validation.md --range estimator/validated_range.yaml
+# docs/validation.md, all of it: every section comes from one of these commands.
+CAMPAIGN = $(BIN)/surecut campaign --jobs 2 --validation docs/validation.md
+REAL ?= ../shared/data
+
+campaign: campaign-measurements campaign-pixels campaign-real
+
+campaign-measurements: $(READY)
+	$(CAMPAIGN) -o logs/campaign --runs 1000
+	$(CAMPAIGN) -o logs/outliers --scenario outliers --runs 100 --against logs/campaign
+	$(CAMPAIGN) -o logs/half-noise --scenario half-noise --runs 100 --against logs/campaign
+	$(CAMPAIGN) -o logs/paper-a --scenario paper-a --runs 90
+	$(CAMPAIGN) -o logs/paper-b --scenario paper-b --runs 90
+	$(CAMPAIGN) -o logs/evidence --leave-out --sensitivity --runs 20
+	$(CAMPAIGN) -o logs/decisions --decisions --runs 200
+	$(CAMPAIGN) -o logs/validation --scenario validation --runs 300 --range estimator/validated_range.yaml
+
+campaign-pixels: $(READY)
+	$(CAMPAIGN) -o logs/pixels --level pixels --scenario validation --runs 42 --recordings logs/recordings
+
+campaign-real: $(READY)
+	$(CAMPAIGN) -o logs/real --real $(REAL)
 
 clean:
 	rm -rf $(VENV) build *.egg-info

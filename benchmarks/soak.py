@@ -7,17 +7,24 @@ costs at most 1.1 times the first and memory grows by less than 5 % after the fi
 """
 
 import argparse
+import contextlib
 import json
 import os
+import shutil
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
-from surecut.estimator.sensing import wanted_topics
 from surecut.estimator.stream.settings import StreamSettings
 from surecut.estimator.stream.stream import Stream
+from surecut.io.live.foxglove_server import FoxgloveServer
+from surecut.io.live.json_server import JsonServer
+from surecut.io.live.recorder import Recorder
 from surecut.io.live.replay import Replay
+from surecut.io.live.web_server import WebServer
 from surecut.io.reader import LogReader
 
 COST, MEMORY = 1.1, 1.05
@@ -27,21 +34,25 @@ TICKS = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One look at the three processes."""
+    """One look at the four processes."""
 
     stamp_s: float
     """Of the input, since its start."""
     frames: int
     cpu_s: tuple[float, ...]
-    """Of ordering and publishing, front ends, graph."""
+    """Of ordering and publishing, tracking, other front ends, graph."""
     rss_mb: tuple[float, ...]
+
+
+class _Enough(Exception):
+    """The run is long enough."""
 
 
 def looked(stream: Stream, first_ns: int) -> Sample:
     pids = [os.getpid(), *stream.pids()]
     return Sample(
         (stream.stamp_ns() - first_ns) * 1e-9,
-        stream.counts.get("frames", 0),
+        stream.counts().get("frames", 0),
         tuple(cpu_s(pid) for pid in pids),
         tuple(rss_mb(pid) for pid in pids),
     )
@@ -59,7 +70,10 @@ def rss_mb(pid: int) -> float:
 def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
     with LogReader(log) as reader:
         rig = rig_of(reader, None)
-    stream = Stream(rig, [Replay(log, None, wanted_topics(rig), repeat=10**6)], [], StreamSettings(), live=False)
+    source = Replay(log, None, wanted_topics(rig), repeat=10**6)
+    folder = Path(tempfile.mkdtemp(prefix="surecut-soak-"))
+    sinks = [FoxgloveServer(port=0), JsonServer(), WebServer(), Recorder(folder / "soak.mcap")]
+    stream = Stream(rig, [source], sinks, StreamSettings(), live=False, checkpoint=folder / "memory.json")
     samples: list[Sample] = []
     began = time.monotonic()
     first: list[int] = []
@@ -72,12 +86,18 @@ def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
             first.append(stream.stamp_ns())
         seconds = (stream.stamp_ns() - first[0]) * 1e-9
         if seconds - last[0] >= 2.0 or not samples:
+            if int(seconds / 60) > int(last[0] / 60):
+                print(f"{seconds / 60:.0f} min of input after {time.monotonic() - began:.0f} s", flush=True)
             last[0] = seconds
             samples.append(looked(stream, first[0]))
         if seconds >= 60 * minutes or time.monotonic() - began > wall_s:
-            stream.stop()
+            raise _Enough  # what still waits has been measured enough
 
-    stream.run(progress)
+    try:
+        with contextlib.suppress(_Enough):
+            stream.run(progress)
+    finally:
+        shutil.rmtree(folder)
     print(json.dumps({k: v for k, v in stream.counters().items() if not k.startswith("source")}))
     if stream.last_problem:
         print(stream.last_problem)
@@ -88,7 +108,7 @@ def table(samples: list[Sample]) -> bool:
     """Prints cost by tenths and memory; whether both stay within their limits."""
     end = samples[-1].stamp_s
     print(f"{end / 60:.1f} minutes of input, {samples[-1].frames} frames")
-    print("input min   cpu ms per frame: ordering  front ends  graph   resident MB")
+    print("input min   cpu ms per frame: ordering  tracking  front ends  graph   resident MB")
     costs = []
     for tenth in range(10):
         part = [s for s in samples if tenth * end / 10 <= s.stamp_s <= (tenth + 1) * end / 10]
@@ -98,7 +118,7 @@ def table(samples: list[Sample]) -> bool:
         cost = [1e3 * (b - a) / frames for a, b in zip(part[0].cpu_s, part[-1].cpu_s, strict=True)]
         costs.append(sum(cost))
         memory = " ".join(f"{m:.0f}" for m in part[-1].rss_mb)
-        parts = f"{cost[0]:9.1f} {cost[1]:11.1f} {cost[2]:6.1f}"
+        parts = f"{cost[0]:9.1f} {cost[1]:9.1f} {cost[2]:11.1f} {cost[3]:6.1f}"
         print(f"{part[-1].stamp_s / 60:9.1f} {sum(cost):18.1f} {parts}   {memory}")
     if not costs:
         print("too short to tell")

@@ -69,7 +69,7 @@ def edges(scene: Surroundings, pipe: str, point: int, view: View) -> list[Predic
     K = values.atCal3DS2(keys.intrinsics("m_left")).K()
     lines = outline_lines(a, b - a, float(values.atVector(keys.radius(i))[0]), K)
     own = typical_edge(scene)
-    if lines is None or own is None:
+    if lines is None or own is None or not values.exists(keys.inset(i)):
         return []
     px = K @ view.o_T_m.transformTo(values.atPoint3(point))
     found = []

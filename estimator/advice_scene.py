@@ -29,6 +29,9 @@ TIED_BY_AT_LEAST = 6
 CLEAR_OF_SIGHT_M = 0.03
 """A mapped point nearer to the line of sight than this hides what is behind it."""
 
+TYPICAL = 500
+"""Measurements of a kind whose sigmas tell what is typical."""
+
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -160,16 +163,26 @@ def look_at(eye: Float, target: Float, down: Float) -> gtsam.Pose3:
 
 
 def _typical_sigmas(active: Active) -> dict[tuple[str, str], float]:
-    """Median sigma by family and camera, of measurements that are pixels."""
-    found: dict[tuple[str, str], list[float]] = defaultdict(list)
+    """Median sigma by family and camera, of measurements that are pixels: of some of them, evenly spread."""
+    members: dict[tuple[str, str], list[gtsam.NonlinearFactor]] = defaultdict(list)
     for _, factor, record in active:
-        if record.camera is None or factor.dim() != 2 or isinstance(factor, gtsam.CustomFactor):
-            continue
-        model = factor.noiseModel()  # type: ignore[attr-defined]
-        model = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
-        if isinstance(model, gtsam.noiseModel.Gaussian):
-            found[record.family, record.camera].append(float(np.sqrt(np.trace(model.covariance()) / 2)))
-    return {kind: float(np.median(sigmas)) for kind, sigmas in found.items()}
+        if record.camera is not None:
+            members[record.family, record.camera].append(factor)
+    found = {}
+    for kind, factors in members.items():
+        sigmas = [s for f in factors[:: -(-len(factors) // TYPICAL)] if (s := _pixel_sigma(f)) is not None]
+        if sigmas:
+            found[kind] = float(np.median(sigmas))
+    return found
+
+
+def _pixel_sigma(factor: gtsam.NonlinearFactor) -> float | None:
+    """Sigma of a measurement of two coordinates; None for anything else."""
+    if factor.dim() != 2 or isinstance(factor, gtsam.CustomFactor):
+        return None
+    model = factor.noiseModel()  # type: ignore[attr-defined]
+    model = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
+    return float(np.sqrt(np.trace(model.covariance()) / 2)) if isinstance(model, gtsam.noiseModel.Gaussian) else None
 
 
 def _spread(px: Float, rows: NDArray[np.int64], all_keys: NDArray[np.uint64], preferred: set[int]) -> list[int]:

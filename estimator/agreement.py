@@ -1,5 +1,7 @@
 """Independent ways to the same thing, compared: what the Kinect's cloud says about a pipe, and what all else says."""
 
+from collections.abc import Mapping
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,7 @@ from .correlation import Active
 from .depth_pipes import DepthPipes, SeenCylinder
 from .graph import Record
 from .linear import LinearSystem, deviate
+from .surfaces import FAMILY as CLOUD
 
 Float = NDArray[np.float64]
 
@@ -55,3 +58,21 @@ def cylinder_event(test: PriorTest) -> Event | None:
     )
     severity = "error" if test.sigma > ERROR_SIGMA else "warning"
     return Event(test.record.stamp_ns, "pipe_disagrees", text, severity, {"sigma": test.sigma})
+
+
+def cloud_event(without: Mapping[tuple[str, str], float], stamp_ns: int) -> Event | None:
+    """What a user has to know where points lie elsewhere by the Kinect's cloud than by boards and mount alone.
+
+    Args:
+        without: sigmas by point and family left out, see `without_families`.
+    """
+    moved = {point: sigma for (point, family), sigma in without.items() if family == CLOUD}
+    worst = max(moved, key=lambda point: moved[point], default="")
+    if not worst or moved[worst] < TOLD_SIGMA:
+        return None
+    text = (
+        f"by the Kinect's cloud {worst} lies {moved[worst]:.1f} sigma from where boards and mount put it: the mount is "
+        "wrong, or the Kinect or a board has been moved; measure the mount again"
+    )
+    severity = "error" if moved[worst] > ERROR_SIGMA else "warning"
+    return Event(stamp_ns, "cloud_disagrees", text, severity, {"sigma": moved[worst]})

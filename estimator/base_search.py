@@ -43,6 +43,7 @@ class BaseSearch:
     def see(self, pair: PairImages) -> None:
         """A keyframe's pictures."""
         index = self._engine.keyframe_at.get(pair.stamp_ns)
+        self._views = [view for view in self._views if self._engine.state.has(keys.keyframe(view.keyframe))]
         if index is None or len(self._views) >= MOST_VIEWS or self._engine.state.has(self._engine.base):
             return
         pose = self._pose(index)
@@ -60,7 +61,7 @@ class BaseSearch:
         """
         engine = self._engine
         mounted = engine.rig.mount is not None and not last
-        new = len(self._views) - self._searched
+        new = len(self._views) - min(self._searched, len(self._views))
         if view is None or mounted or engine.state.has(engine.base) or not engine.odometry.observations:
             return False
         if new < (1 if last else FIRST_VIEWS):

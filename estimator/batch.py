@@ -56,7 +56,7 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            values, more = optimum(_without(log, off), at.values)
+            values, more = optimum(without_factors(log, off), at.values)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
     at = with_correlated_tracks(at, ODOMETRY)
@@ -76,7 +76,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gts
     return values, optimiser.iterations()
 
 
-def _without(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:
+def without_factors(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for index, factor, _ in log.active():
         if index not in off:
@@ -121,13 +121,10 @@ def landmark_depth(factor: gtsam.NonlinearFactor, record: Record, values: gtsam.
 
 def orphans(at: Linearised, off: set[int]) -> list[tuple[int, Rejection]]:
     """What is left of landmarks that the removal of outliers left with one view: it determines no point."""
-    touching: dict[int, list[int]] = {}
-    for position, (_, factor, _) in enumerate(at.active):
-        for key in factor.keys():
-            if keys.kind(key) == "l":
-                touching.setdefault(key, []).append(position)
+    gone = [factor for index, factor, _ in at.active if index in off]
+    landmarks = sorted({key for factor in gone for key in factor.keys() if keys.kind(key) == "l"})
     found = []
-    for positions in touching.values():
+    for positions in at.system.touching(landmarks):
         left = [p for p in positions if at.active[p][0] not in off]
         views = sum(at.active[p][2].camera is not None for p in left)
         if len(left) == len(positions) or views >= MINIMUM_VIEWS:

@@ -15,6 +15,7 @@ from ..factors.measurements import Event, MarkerSighting, Rejection
 from ..factors.rig import Rig
 from ..frontends.board_check import Suspicion, suspicious_markers
 from ..frontends.board_fit import board_corners, fit_board
+from ..frontends.board_gross import without_gross_corners
 from ..frontends.board_pose import apparent_side, board_pose_candidates
 from .board_start import relabelled
 from .graph import State
@@ -29,6 +30,9 @@ VIEWS_TO_EXCHANGE = 2
 """Images of different moments that have to agree that two ids are exchanged: a whole-board fit decides each."""
 VIEWS_TO_RELEASE = 3
 """Images of different moments in a row that have to agree that a marker is off its place."""
+SAME_SHIFT_SIGMA, SAME_SHIFT_SHARE = 4.0, 0.3
+"""Two views show a marker in one place when their shifts agree within that: noise, and views share errors of lens and
+print, which grow with the shift."""
 DOUBLED = "stands in the image more than once"
 SAME_PX = 1.0
 """Two sightings of an id that are nearer to each other than this are one."""
@@ -45,10 +49,20 @@ class _Votes:
     sigmas_m: list[float] = field(default_factory=list)
 
     def add(self, stamp_ns: int, found: Suspicion) -> None:
+        """One more moment; begins anew where it contradicts those before: what is loose lies in one place."""
         if stamp_ns not in self.stamps:
+            if self.stamps and self._contradicts(found):
+                self.stamps, self.shifts_m, self.sigmas_m = [], [], []
             self.stamps.append(stamp_ns)
             self.shifts_m.append(found.shift_m)
             self.sigmas_m.append(found.shift_sigma_m)
+
+    def _contradicts(self, found: Suspicion) -> bool:
+        weights = 1.0 / np.square(self.sigmas_m)
+        mean = np.average(np.array(self.shifts_m), axis=0, weights=weights)
+        off = float(np.linalg.norm(mean - found.shift_m))
+        sigma = float(np.hypot(found.shift_sigma_m, min(self.sigmas_m)))
+        return off > max(SAME_SHIFT_SIGMA * sigma, SAME_SHIFT_SHARE * float(np.linalg.norm(mean)))
 
     def length(self) -> tuple[float, float]:
         """Shift and its sigma, m: the views share most of their errors, so that they are no better than the best."""
@@ -144,15 +158,13 @@ class Inspection:
         if len(seen) < 2:
             return seen
         key = (sheet.board.id, seen[0].camera)
-        # the page's tolerance is no contradiction: judged with what the rig allows on top of the corners' own noise
-        judged = [replace(s, common_px=None) for s in seen]
-        fit = self._fit(sheet, judged)
-        past = self._fits.setdefault(key, [])
-        scale = max(1.0, float(np.median(past))) if len(past) > 4 else 1.0
-        if fit is not None and fit[0] < chi2_isf(FALSE_ALARM, fit[1]) * scale:
-            self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
-            self._clear(sheet, seen)
+        if self._holds_together(sheet, key, seen):
             return seen
+        seen = self._without_gross(sheet, seen)
+        if len(seen) < 2 or self._holds_together(sheet, key, seen):
+            return seen
+        judged = _judged_by_rig(seen)
+        fit, past = self._fit(sheet, judged), self._fits.setdefault(key, [])
         board, common = sheet.board, self._rig.noise.marker_common_px
         side = self._side(sheet) if sheet.page_known else self._side_without_one(sheet, judged)
         found = suspicious_markers(judged, board, self._pinhole(seen[0].camera), side, common)
@@ -161,6 +173,31 @@ class Inspection:
                 self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
             return seen
         return self._judged(sheet, seen, found)
+
+    def _holds_together(self, sheet: Sheet, key: tuple[str, str], seen: list[MarkerSighting]) -> bool:
+        """Do all corners of an image fit as well as those of other images do?"""
+        fit = self._fit(sheet, _judged_by_rig(seen))
+        past = self._fits.setdefault(key, [])
+        scale = max(1.0, float(np.median(past))) if len(past) > 4 else 1.0
+        if fit is None or fit[0] >= chi2_isf(FALSE_ALARM, fit[1]) * scale:
+            return False
+        self._fits[key] = [*past, fit[0] / fit[1]][-MEMORY:]
+        self._clear(sheet, seen)
+        return True
+
+    def _without_gross(self, sheet: Sheet, seen: list[MarkerSighting]) -> list[MarkerSighting]:
+        """Leaves out single corners, and markers of which nothing is left."""
+        camera, common = self._pinhole(seen[0].camera), self._rig.noise.marker_common_px
+        side = self._side(sheet)
+        judged = _judged_by_rig(seen)
+        kept, gross = without_gross_corners(judged, sheet.board, camera, side, common, side_free=not sheet.page_known)
+        for one in gross:
+            part = "" if one.corner is None else f" corner {one.corner}"
+            what = f"marker {one.sighting.marker}{part} of board {sheet.board.id} in {one.sighting.camera}"
+            reason = "gross against the rest of the image, whitened residual"
+            self.rejected.append(Rejection(one.sighting.stamp_ns, FAMILY, what, reason, one.norm, one.limit))
+        named = {s.marker: s.gross for s in kept}
+        return [replace(s, gross=named[s.marker]) for s in seen if s.marker in named]
 
     def _fit(self, sheet: Sheet, seen: list[MarkerSighting]) -> tuple[float, int] | None:
         """Chi-square and degrees of freedom of one image, its side length free."""
@@ -207,7 +244,8 @@ class Inspection:
         off = {s.marker for s in found}
         self._clear(sheet, [s for s in seen if s.marker not in off])
         for suspicion in found:
-            self._vote(sheet, stamp_ns, suspicion)
+            if suspicion.explained:
+                self._vote(sheet, stamp_ns, suspicion)
         refused = [s.marker in off for s in seen]
         return self._without(seen, refused, sheet, "off its place against the rest of the image, markers")
 
@@ -267,6 +305,11 @@ class Inspection:
         named = {"marker": float(marker), **values}
         event = Event(stamp_ns, kind, text, severity, named)  # type: ignore[arg-type]
         self.events.setdefault((kind, board, marker), event)
+
+
+def _judged_by_rig(seen: list[MarkerSighting]) -> list[MarkerSighting]:
+    """The page's tolerance is no contradiction: with what the rig allows on top of the corners' own noise."""
+    return [replace(s, common_px=None) for s in seen]
 
 
 def _distinct(seen: list[MarkerSighting]) -> list[MarkerSighting]:

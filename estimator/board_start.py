@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from ..factors import keys
 from ..factors.board import page_corners
 from ..factors.camera import CameraModel
+from ..factors.errors import ObservabilityError
 from ..factors.geometry import pose3
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Noise, Rig
@@ -89,11 +90,14 @@ class FirstPose:
         board = sheet.board
         mine = _of_best_camera(seen)
         if len({s.marker for s in mine}) > 1:
-            length, sigma = apparent_side(mine, board, self.pinhole(mine[0].camera), self._rig.noise.marker_common_px)
+            camera, common = self.pinhole(mine[0].camera), self._rig.noise.marker_common_px
+            try:
+                length, sigma = apparent_side(mine, board, camera, common)
+            except ObservabilityError:  # corners that no pose explains say nothing of the side
+                return Side(board.side_m, None)
             spread = np.array([sheet.marker(s.marker).centre_m for s in mine])
             radius = float(np.sqrt(((spread - spread.mean(0)) ** 2).sum()))
-            middles = np.array([s.corners_px.mean(0) for s in mine])
-            half_px = np.linalg.norm(np.array([s.corners_px for s in mine]) - middles[:, None], axis=2).mean()
+            half_px = 0.5 * float(np.mean([s.diagonal_px for s in mine]))
             inset = inset_sigma_px(mine[0], self._rig.noise) / half_px
             place = board.centre_sigma_m * np.sqrt(2) / radius
             return Side(length, float(np.linalg.norm([sigma, length * place, length * inset])))
@@ -101,6 +105,7 @@ class FirstPose:
 
     def _stereo_side(self, seen: Sequence[MarkerSighting]) -> Side | None:
         """Mean edge of a marker that both mobile cameras see, by triangulation with the calibration believed now."""
+        seen = [s for s in seen if not s.gross]
         left = {s.marker: s for s in seen if s.camera == "m_left"}
         both = [(left[s.marker], s) for s in seen if s.camera == "m_right" and s.marker in left]
         if not both:
@@ -162,13 +167,14 @@ class FirstPose:
             o_T_c = self._state.pose(key)
             if camera != "m_left":
                 o_T_c = o_T_c.compose(self._state.pose(keys.extrinsics(camera)))
-            covariance = np.concatenate([corner_covariance(s, self._rig.noise.marker_common_px) for s in mine])
+            common = self._rig.noise.marker_common_px
+            covariance = np.concatenate([corner_covariance(s, common)[s.good] for s in mine])
             views.append(
                 _View(
                     self.pinhole(camera).K,
                     o_T_c,
-                    np.concatenate([page_corners(sheet.marker(s.marker), side_m) for s in mine]),
-                    np.concatenate([s.corners_px for s in mine]),
+                    np.concatenate([page_corners(sheet.marker(s.marker), side_m)[s.good] for s in mine]),
+                    np.concatenate([s.corners_px[s.good] for s in mine]),
                     np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1), float),
                 )
             )

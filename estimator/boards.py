@@ -92,8 +92,8 @@ class Boards:
         seen = self.usable(sightings)
         if not seen:
             return np.zeros((0, 3)), np.zeros((0, 2))
-        points = [self._predicted(self.sheets[s.board], s.marker) for s in seen]
-        return np.concatenate(points), np.concatenate([s.corners_px for s in seen])
+        points = [self._predicted(self.sheets[s.board], s.marker)[s.good] for s in seen]
+        return np.concatenate(points), np.concatenate([s.corners_px[s.good] for s in seen])
 
     def usable(self, sightings: Sequence[MarkerSighting]) -> list[MarkerSighting]:
         """Sightings of known boards, under the ids whose places they have, without loose markers."""
@@ -325,7 +325,7 @@ class Boards:
         for camera in sorted({s.camera for s in seen}):
             mine = [s for s in seen if s.camera == camera]
             expected = [self._pixels(camera, camera_poses[camera], self._predicted(sheet, s.marker)) for s in mine]
-            shifts = [(s.corners_px - e).mean(0) for s, e in zip(mine, expected, strict=True)]
+            shifts = [(s.corners_px - e)[s.good].mean(0) for s, e in zip(mine, expected, strict=True)]
             found.append((mine, np.array(shifts)))
         return found
 
@@ -337,7 +337,7 @@ class Boards:
         for mine, shifts in self._shifts(sheet, camera_poses, seen):
             common = np.median(shifts, axis=0)
             for s, shift in zip(mine, shifts, strict=True):
-                size = float(np.linalg.norm(s.corners_px[0] - s.corners_px[2])) / np.sqrt(2)
+                size = s.diagonal_px / np.sqrt(2)
                 limit = max(0.25 * size, 6 * float(np.sqrt(np.trace(s.covariance_px2.mean(0)))))
                 off = float(np.linalg.norm(shift - common)) if len(mine) > 2 else float(np.linalg.norm(shift)) / 3
                 if off < limit:

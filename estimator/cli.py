@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import typer
 
 from ..factors.errors import SurecutError
+from .threads import use_one_thread
 
 GROUP = "surecut.commands"
 
@@ -32,6 +33,7 @@ GROUP = "surecut.commands"
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit with its status."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a bad image is told in our own one line
+    use_one_thread()
     given = list(sys.argv[1:] if arguments is None else arguments)
     run = typer.main.get_command(application(given))
     try:

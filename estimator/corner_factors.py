@@ -40,14 +40,14 @@ class CornerFactors:
         """By camera and board: how far its corners may all lie inside (or outside) of the true ones."""
 
     def add(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> bool:
-        """Four corners in one image; False where its place has been seen from often enough."""
+        """The corners of a marker in one image; False where its place has been seen from often enough."""
         covariance = self._with_common_part(sheet, keyframe, sighting, update)
         if covariance is None:
             return False
         self._note_source(sighting)
         slot = self._slot(sheet, sighting, update)
         source = f"corners {sighting.camera} {sheet.board.id}"
-        for i in range(4):
+        for i in map(int, sighting.good):
             model = robust(gaussian(covariance[i]), self._rig.gates.robust_sigma)
             point = keys.corner(slot, i)
             if sighting.camera == "b_rgb":
@@ -88,9 +88,8 @@ class CornerFactors:
 
     def _detection_error_m(self, sighting: MarkerSighting, side_m: float) -> float:
         """A corner's lasting detection error on the page, from its size in this first view."""
-        lasting = np.sqrt(LASTING) * max(self._rig.noise.marker_common_px, sighting.common_px or 0.0)
-        diagonal = float(np.linalg.norm(sighting.corners_px[0] - sighting.corners_px[2]))
-        return lasting * side_m * float(np.sqrt(2.0)) / max(diagonal, 1.0)
+        lasting = float(np.sqrt(LASTING)) * max(self._rig.noise.marker_common_px, sighting.common_px or 0.0)
+        return lasting * side_m * float(np.sqrt(2.0)) / max(sighting.diagonal_px, 1.0)
 
     def _with_common_part(self, sheet: Sheet, keyframe: int, sighting: MarkerSighting, update: Update) -> Float | None:
         """Adds the part of a corner's error that views from the same place share; None where they are plenty.

@@ -21,6 +21,7 @@ from ..factors.measurements import (
 )
 from ..factors.rig import Distance, Rig
 from ..frontends.pick_image import CutOut
+from .adrift import Adrift
 from .boards import Boards
 from .bundle import Bundle
 from .calibration_states import opened_calibration
@@ -58,10 +59,11 @@ class Engine:
         self.state, self.solver = self.graph.state, self.graph.solver
         sigma = rig.gates.robust_sigma
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
-        self.odometry.joint_covariance = self.solver.joint_covariance
+        self.odometry.gate.joint_covariance = self.solver.joint_covariance
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
+        self.adrift = Adrift(self.graph, self.odometry, self.boards)
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
         self.distances = KnownDistances(rig, self.state, self.boards)
         self.events: list[Event] = []
@@ -132,9 +134,12 @@ class Engine:
                 return
             self.astray = False
             index = self.odometry.last_keyframe + 1
+            self.adrift.anchor(bundle.frame, _mobile(bundle))
+            before = frozenset(self.state.values.keys())
             update, rejected = self.odometry.insert(bundle.frame, placed)
             self.rejected += rejected
             self.graph.take(update)
+            self.adrift.begin(before, self.odometry.gap_s)
         else:
             placed = self._place_by_markers(bundle)
             if placed is None:
@@ -148,7 +153,8 @@ class Engine:
         self._unsolved += 1
         if bundle.frame is not None:
             self.flush()
-            self.machine.lay_landmarks(index)
+            if not self.adrift:
+                self.machine.lay_landmarks(index)
 
     def _relocalised(self, bundle: Bundle) -> gtsam.Pose3 | None:
         """Where the camera stands in the map of an earlier run, by the boards that it sees."""

@@ -6,21 +6,19 @@ process down with it, is an outcome with its reason and does not stop the others
 
 import importlib
 import multiprocessing
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from ..factors.errors import SurecutError
+from .threads import single_threaded_children
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 ATTEMPTS = 2
 """A task whose process died is tried once more: another task in the pool may have been the cause."""
 
@@ -119,21 +117,6 @@ def choose_executor(jobs: int = 1, dask: str | None = None) -> Executor:
     if dask is not None:
         return DaskExecutor(dask)
     return ProcessExecutor(jobs) if jobs > 1 else SerialExecutor()
-
-
-@contextmanager
-def single_threaded_children() -> Iterator[None]:
-    """Processes started meanwhile run their numeric libraries with one thread: the jobs share the cores already."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 def _attempt(task: Callable[[Item], Value], item: Item) -> Outcome[Item, Value]:

@@ -86,6 +86,11 @@ class FactorLog:
         self.factors.extend(update.factors)
         self.records.extend(update.records)
 
+    def replace(self, index: int, factor: gtsam.NonlinearFactor) -> None:
+        """Another factor in the place of one that says the same, or a part of it."""
+        self.factors[index] = factor
+        self._off_graph = -1
+
     def active(self) -> Iterator[tuple[int, gtsam.NonlinearFactor, Record]]:
         for index, (factor, record) in enumerate(zip(self.factors, self.records, strict=True)):
             if index not in self.off:

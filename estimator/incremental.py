@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 import gtsam
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, gaussian_of, marginal
+from .marginal import FAMILY, GaussianPrior, gaussian_of, joint_of, marginal, renamed, without
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -28,6 +29,7 @@ _THRESHOLDS = {
     "v": [2e-4] * 3,
     "h": [1e-5, 1e-4],
     "r": [1e-4],
+    "w": [1e-4],
     "k": [0.01, 0.01, 1.0, 0.01, 0.01, 1e-4, 1e-4, 1e-4, 1e-4],
     "d": [2e-4, 2e-4],
     "g": [1e-5, 1e-5, 1e-4],
@@ -37,9 +39,11 @@ RELINEARIZE_EVERY = 10
 """Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
 of a batch solution; `settle` makes up for what is left at the end."""
 
-SETTLE_ROUNDS = 2
-"""Relinearisations before variables leave: what they say is frozen where it is taken."""
+SETTLED = 0.1
+"""Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
 
+MOVED_ROUNDS = 3
+"""Steps after a part of the map was moved."""
 
 MOST_DROPPED = 50
 """Landmarks that one update may lose: wrong matches come one at a time, a graph that falls apart is another matter."""
@@ -73,6 +77,7 @@ class Incremental:
         self._slots: list[int | None] = []
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
+        self._relocated = False
         self.log = FactorLog()
         self.dropped: list[int] = []
         """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
@@ -92,6 +97,11 @@ class Incremental:
         first = self._isam.getFactorsUnsafe().size()
         self.log.append(update)
         self.log.off.update(removed)
+        if self._relocated:
+            self._relocated = False
+            self._values.insert(update.values)
+            self._begin(self._values)
+            return self.settle(MOVED_ROUNDS)
         try:
             with determined():
                 self._isam.update(graph, update.values, slots)
@@ -118,7 +128,13 @@ class Incremental:
     def _drop(self, landmark: int) -> None:
         """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
         self.dropped.append(landmark)
-        self.log.off.update(i for i, factor, _ in self.log.active() if landmark in factor.keys())
+        for index, factor, record in [row for row in self.log.active() if landmark in row[1].keys()]:
+            prior = joint_of(factor, self._values) if record.family == FAMILY else None
+            rest = None if prior is None else without(prior, {landmark})
+            if rest is None:
+                self.log.off.add(index)
+            else:  # what is known of everything else does not go with it
+                self.log.replace(index, rest.factor())
         self._values.erase(landmark)
 
     def _rebuild(self) -> None:
@@ -141,7 +157,7 @@ class Incremental:
             values = optimiser.optimize()
             self._isam = gtsam.ISAM2(_parameters("QR"))
             self._isam.update(graph, values)
-        self._values = self._isam.calculateEstimate()
+            self._values = self._isam.calculateEstimate()
 
     def values(self) -> gtsam.Values:
         """The estimate over the factors of the log."""
@@ -157,8 +173,7 @@ class Incremental:
         Raises:
             ObservabilityError: a variable that leaves is not determined.
         """
-        self.settle(SETTLE_ROUNDS)
-        values = gtsam.Values(self._values)
+        values = self._stepped()
         past = {key: keys.landmark_before(keys.index(key)) for key in cut.split}
         for key, before in past.items():
             values.insert(before, values.atPoint3(key))
@@ -167,9 +182,12 @@ class Incremental:
         log = FactorLog()
         for _, factor, record in self.log.active():
             involved = set(factor.keys())
-            if involved & cut.dropped:
+            if record.family == FAMILY:
+                left = without(joint_of(factor, values), cut.dropped)
+                absorbed += [] if left is None else [renamed(left, past).factor()]
+            elif involved & cut.dropped:
                 continue
-            if involved & cut.leaving or record.family == FAMILY:
+            elif involved & cut.leaving:
                 torn = [past.get(key, key) for key in factor.keys()]
                 absorbed.append(factor.rekey(torn) if involved & cut.split else factor)
             else:
@@ -186,6 +204,17 @@ class Incremental:
         self._begin(values)
         return gtsam.Values(self._values)
 
+    def _stepped(self) -> gtsam.Values:
+        """The estimate one full Newton step on: what leaves is frozen where it is taken. iSAM2 would need several times
+        as long for it, and is begun anew afterwards."""
+        graph = self.log.graph()
+        try:
+            with determined():
+                return self._values.retract(graph.linearize(self._values).optimize())
+        except Undetermined:
+            self._restart()
+            return gtsam.Values(self._values)
+
     def _begin(self, values: gtsam.Values) -> None:
         """iSAM2 anew on all factors, linearised at `values`."""
         self._isam = gtsam.ISAM2(_parameters())
@@ -196,32 +225,67 @@ class Incremental:
         except Undetermined:
             self._restart()
             return
-        self._slots = list(range(len(self.log.factors)))
+        places = count()
+        self._slots = [None if i in self.log.off else next(places) for i in range(len(self.log.factors))]
         self._values = self._isam.calculateEstimate()
+
+    def relocate(self, values: gtsam.Values) -> gtsam.Values:
+        """Values that no step would reach, because a part of the map has been found to lie elsewhere.
+
+        The next update brings what holds it there; the solver begins anew with that.
+        """
+        self._values, self._relocated = values, True
+        return gtsam.Values(values)
 
     def settle(self, rounds: int) -> gtsam.Values:
-        """Updates without new data until nothing needs relinearising any more, at most `rounds` times."""
-        empty, none = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.
+
+        While it runs it relinearises what has moved far enough, now and then; what many small moves make together,
+        up to a fifth of a sigma, is made up for here. That takes a fraction of the time that relinearising in place
+        takes, because the elimination is ordered for the whole graph.
+        """
         for _ in range(rounds):
-            try:
-                with determined():
-                    result = self._isam.update(empty, none, force_relinearize=True)
-            except Undetermined:
-                self._restart()
-                continue
-            if result.getVariablesRelinearized() == 0:
+            before, dropped = self.log.graph().error(self._values), len(self.dropped)
+            self._begin(self._values)
+            # a landmark that was given up took its factors along: another graph, and no error to compare with
+            if len(self.dropped) == dropped and before - self.log.graph().error(self._values) < SETTLED:
                 break
-        self._values = self._isam.calculateEstimate()
         return gtsam.Values(self._values)
 
-    def joint_covariance(self, keys: Sequence[int]) -> Float:
-        """Joint covariance of some variables, in the order of `keys`."""
-        joint = gaussian_of(self.log.graph(), self._values, keys)
-        covariance = np.linalg.inv(joint.H)
+    def joint_covariance(self, wanted: Sequence[int]) -> Float:
+        """Joint covariance of some variables, in the order of `wanted`.
+
+        Raises:
+            ObservabilityError: one of them is not determined, or another variable that is no landmark's.
+        """
+        joint = self._joint_of(wanted)
+        try:
+            covariance = np.linalg.inv(joint.H)
+        except np.linalg.LinAlgError as error:
+            weakest = int(np.abs(np.linalg.eigh(joint.H)[1][:, 0]).argmax())
+            raise Undetermined(int(np.repeat(joint.keys, joint.widths)[weakest])) from error
         ends = np.cumsum(joint.widths)
         columns = {k: np.arange(end - w, end) for k, w, end in zip(joint.keys, joint.widths, ends, strict=True)}
-        chosen = np.concatenate([columns[key] for key in keys])
+        chosen = np.concatenate([columns[key] for key in wanted])
         return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
+
+    def _joint_of(self, wanted: Sequence[int]) -> GaussianPrior:
+        """Landmarks that nothing determines at this linearisation say nothing: they are passed over."""
+        graph = self.log.graph()
+        for _ in range(MOST_DROPPED):
+            try:
+                with determined():
+                    return gaussian_of(graph, self._values, wanted)
+            except Undetermined as error:
+                if keys.kind(error.key) != "l" or error.key in wanted:
+                    raise
+                lost, rest = error.key, gtsam.NonlinearFactorGraph()
+                for factor in (graph.at(i) for i in range(graph.size())):
+                    if lost not in factor.keys():
+                        rest.add(factor)
+                graph = rest
+        with determined():
+            return gaussian_of(graph, self._values, wanted)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:

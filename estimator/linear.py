@@ -8,7 +8,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, identity, vstack
+from scipy.sparse import csc_matrix, csr_matrix, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -19,7 +19,9 @@ DETERMINED = 1e-3
 """A residual direction with less than this share of its own variance left is determined by its own measurement."""
 
 CHUNK = 384
-"""Right-hand sides that are solved together."""
+"""Right-hand sides that are solved together, at most."""
+CHUNK_ENTRIES = 8_000_000
+"""... and entries (rows of the system times right-hand sides): 64 MB, however long the recording."""
 
 
 def deviate(total: float, dof: int) -> float:
@@ -91,6 +93,21 @@ class LinearSystem:
     def parameters(self) -> int:
         return self._columns
 
+    def touching(self, keys: Sequence[int]) -> list[list[int]]:
+        """Positions of the factors that each variable is in."""
+        by_column = csc_matrix(self.A)
+        found = []
+        for key in keys:
+            column = self.columns[key]
+            rows = by_column.indices[by_column.indptr[column.start] : by_column.indptr[column.stop]]
+            found.append(np.unique(np.searchsorted(self.starts, rows, side="right") - 1).tolist())
+        return found
+
+    @property
+    def _together(self) -> int:
+        """Right-hand sides that are solved together."""
+        return max(1, min(CHUNK, CHUNK_ENTRIES // max(len(self.b), 1)))
+
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
         return self._normal.solve(right)
@@ -134,7 +151,7 @@ class LinearSystem:
     def marginals(self, keys: Sequence[int]) -> list[Float]:
         """Each variable's own covariance."""
         found = []
-        for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys]):
+        for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys], self._together):
             columns = [self.columns[keys[i]] for i in chunk]
             if self.root is None:
                 found += self._normal.inverse_blocks(columns)
@@ -150,7 +167,7 @@ class LinearSystem:
     def hats(self, positions: Sequence[int]) -> list[Float]:
         """Each factor's own block of the hat matrix `A (A^T A)^-1 A^T`."""
         found = []
-        for chunk in _chunks([int(self.rows[p]) for p in positions]):
+        for chunk in _chunks([int(self.rows[p]) for p in positions], self._together):
             rows = [slice(self.starts[positions[i]], self.starts[positions[i] + 1]) for i in chunk]
             A = vstack([self.A[r] for r in rows]).tocsr()
             hat = A @ self.solve(A.T.toarray())
@@ -191,19 +208,21 @@ class LinearSystem:
 
         Hutchinson's estimator with fixed random signs, one solution for all groups; reproducible.
         """
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(self.b.size, probes))
-        hat = (signs * (self.A @ self.solve(self.A.T @ signs))).mean(axis=1)
+        rng, hat = np.random.default_rng(seed), np.zeros(self.b.size)
+        for start in range(0, probes, self._together):
+            signs = rng.choice([-1.0, 1.0], size=(self.b.size, min(self._together, probes - start)))
+            hat += (signs * (self.A @ self.solve(self.A.T @ signs))).sum(axis=1) / probes
         shares = np.bincount(np.repeat(group, self.rows), weights=hat, minlength=groups)
         rows = np.bincount(np.repeat(group, self.rows), minlength=groups).astype(float)
         return np.asarray(np.clip(shares, 0.0, rows), np.float64)
 
 
-def _chunks(widths: Sequence[int]) -> Iterator[list[int]]:
-    """Indices in groups of at most `CHUNK` columns together."""
+def _chunks(widths: Sequence[int], most: int) -> Iterator[list[int]]:
+    """Indices in groups of at most so many columns together."""
     group: list[int] = []
     total = 0
     for i, width in enumerate(widths):
-        if group and total + width > CHUNK:
+        if group and total + width > most:
             yield group
             group, total = [], 0
         group.append(i)

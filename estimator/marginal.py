@@ -4,8 +4,8 @@ Eliminating variables from the linearised problem (the Schur complement) leaves 
 first order about the linearisation point, which the factor keeps: Leutenegger et al. 2015, section 3.3.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -91,18 +91,59 @@ def gaussian_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stay: C
     return _eliminated(graph, values, set(graph.keyVector()).difference(stay))
 
 
+def joint_of(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> GaussianPrior:
+    """What a factor says about its variables to first order."""
+    joint = gtsam.HessianFactor(factor.linearize(values))
+    order = tuple(joint.keys())
+    information = np.asarray(joint.augmentedInformation(), float)
+    widths = tuple(WIDTHS[keys.kind(key)] for key in order)
+    return GaussianPrior(order, widths, information[:-1, :-1], information[:-1, -1], only(values, order))
+
+
+def without(prior: GaussianPrior, gone: Collection[int]) -> GaussianPrior | None:
+    """What a joint Gaussian says about its variables but some; None where these are all.
+
+    Directions of those that it knows nothing about take nothing with them.
+    """
+    stay = [i for i, key in enumerate(prior.keys) if key not in gone]
+    if not stay:
+        return None
+    out = np.repeat([key in gone for key in prior.keys], prior.widths)
+    H, g = prior.H, prior.g
+    taken = H[np.ix_(~out, out)] @ np.linalg.pinv(H[np.ix_(out, out)], rcond=NOTHING_REL, hermitian=True)
+    left = tuple(prior.keys[i] for i in stay)
+    return GaussianPrior(
+        left,
+        tuple(prior.widths[i] for i in stay),
+        H[np.ix_(~out, ~out)] - taken @ H[np.ix_(out, ~out)],
+        g[~out] - taken @ g[out],
+        only(prior.at, left),
+    )
+
+
+def renamed(prior: GaussianPrior, names: Mapping[int, int]) -> GaussianPrior:
+    """The same about other variables of the same kinds: `rekey` of a factor made by `GaussianPrior.factor` would change
+    the factor that it is taken from."""
+    at = gtsam.Values()
+    for key in prior.keys:
+        at.insert(names.get(key, key), value_of(prior.at, key))
+    return replace(prior, keys=tuple(names.get(key, key) for key in prior.keys), at=at)
+
+
 WIDTHS = {
     "x": 6,
     "f": 6,
     "b": 6,
     "e": 6,
     "l": 3,
+    "z": 3,
     "q": 3,
     "p": 3,
     "u": 3,
     "v": 3,
     "h": 2,
     "r": 1,
+    "w": 1,
     "k": 9,
     "d": 2,
     "g": 3,
@@ -123,6 +164,6 @@ def value_of(values: gtsam.Values, key: int) -> gtsam.Pose3 | gtsam.Cal3DS2 | Fl
     kind = keys.kind(key)
     if kind in "xfbe":
         return values.atPose3(key)
-    if kind in "lqpuv":
+    if kind in "lzqpuv":
         return values.atPoint3(key)
     return values.atCal3DS2(key) if kind == "k" else values.atVector(key)

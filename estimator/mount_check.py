@@ -14,7 +14,7 @@ from ..factors.links import mount_pose, weak_pose_prior
 from ..factors.measurements import CloudFrame, Event
 from ..factors.noise import pose_sigmas, robust, sigmas
 from ..frontends.cloud.associate import associate
-from ..frontends.cloud.noise import SMOOTH_SHARE
+from ..frontends.cloud.noise import SMOOTH_RAD, SMOOTH_SHARE
 from ..frontends.cloud.point_registration import register_points
 from .agreement import ERROR_SIGMA, TOLD_SIGMA, cylinder_event, cylinder_test, cylinder_tests
 from .consistency import PriorTest
@@ -29,11 +29,9 @@ from .surfaces import SAME_SIDE_COSINE
 
 Float = NDArray[np.float64]
 
-CELL_RAD = np.deg2rad(15.0)
-"""Part of the view over which a depth camera's smooth distortion counts as one error."""
 SAME_PIPE_SIGMA = 4.0
 WEAK_SIGMA = 0.3
-"""Sigma of {b} (rad, or m at 1 m) beyond which the cloud tells nothing about a mount."""
+"""Sigma of {b} (rad, or m) beyond which the cloud tells nothing about a mount in that direction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +41,8 @@ class MountTest:
     board: str
     sigma: float
     """The disagreement, as the deviate of a normal variable that is as improbable."""
+    directions: int
+    """Of six that the cloud holds; the others, such as along a bare wall, are left out of all of these numbers."""
     shift_m: float
     turn_rad: float
     shift_sigma_m: float
@@ -59,9 +59,10 @@ class MountTest:
         """What a user has to know; None where both ways agree."""
         if self.sigma < TOLD_SIGMA:
             return None
+        held = "" if self.directions == 6 else f", which holds {self.directions} of 6 directions,"
         on_it = f"{self.landmarks} landmarks" + (f" and {self.pipes} pipes" if self.pipes else "")
         text = (
-            f"mount: by {on_it} on the Kinect's cloud {{b}} stands {1e3 * self.shift_m:.0f} +/- "
+            f"mount: by {on_it} on the Kinect's cloud{held} {{b}} stands {1e3 * self.shift_m:.0f} +/- "
             f"{1e3 * self.shift_sigma_m:.0f} mm and {np.degrees(self.turn_rad):.1f} +/- "
             f"{np.degrees(self.turn_sigma_rad):.1f} degrees from the rig file's f_T_b of board {self.board} "
             f"({self.sigma:.1f} sigma); measure the mount again"
@@ -118,15 +119,52 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     linear = unit.linearize(solved)
     J, residual = linear.jacobian()
     spread = without.covariance([(k, J[:, 6 * i : 6 * i + 6]) for i, k in enumerate(linear.keys())])
-    if np.sqrt(np.diag(spread)).max() > WEAK_SIGMA:
-        return None
     own = np.diag([mount.rotation_sigma_rad**2] * 3 + [mount.translation_sigma_m**2] * 3)
-    total = float(residual @ np.linalg.solve(spread + own, residual))
-    size = [float(np.linalg.norm(residual[part])) for part in (slice(0, 3), slice(3, 6))]
-    noise = [float(np.sqrt(np.trace((spread + own)[part, part]))) for part in (slice(0, 3), slice(3, 6))]
+    held = held_part(residual, spread, own)
+    if held is None:
+        return None
+    size = [float(np.linalg.norm(held.residual[part])) for part in (slice(0, 3), slice(3, 6))]
+    noise = [float(np.sqrt(np.trace(held.covariance[part, part]))) for part in (slice(0, 3), slice(3, 6))]
     return MountTest(
-        mount.board, deviate(total, 6), size[1], size[0], noise[1], noise[0], len(planes), len(pipes), cloud.stamp_ns
+        mount.board, deviate(held.total, held.directions), held.directions, size[1], size[0], noise[1], noise[0],
+        len(planes), len(pipes), cloud.stamp_ns,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class HeldPart:
+    """A disagreement along the directions that the looser one of two ways still holds."""
+
+    total: float
+    """Chi-square."""
+    directions: int
+    residual: Float
+    """Shape (6,)."""
+    covariance: Float
+    """Shape (6, 6), of rank `directions`."""
+
+
+def held_part(residual: Float, spread: Float, own: Float) -> HeldPart | None:
+    """The part of a disagreement along the directions that `spread` leaves surer than `WEAK_SIGMA`.
+
+    They are eigenvectors of the spread and do not depend on the residual, so that the chi-square is one of that many
+    degrees of freedom.
+
+    Args:
+        residual: shape (6,), rotation first.
+        spread: shape (6, 6), covariance of the way that may leave directions loose.
+        own: shape (6, 6), covariance of the other.
+
+    Returns:
+        None where nothing is held.
+    """
+    values, vectors = np.linalg.eigh(spread)
+    basis = vectors[:, values < WEAK_SIGMA**2]
+    if basis.shape[1] == 0:
+        return None
+    part, covariance = basis.T @ residual, basis.T @ (spread + own) @ basis
+    total = float(part @ np.linalg.solve(covariance, part))
+    return HeldPart(total, basis.shape[1], basis @ part, basis @ covariance @ basis.T)
 
 
 def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
@@ -176,7 +214,7 @@ def _planes(
     facing = (matches.normal * towards).sum(axis=1) > SAME_SIDE_COSINE * np.linalg.norm(towards, axis=1)
     rows, point, normal = matches.landmark[facing], matches.point_m[facing], matches.normal[facing]
     sigma2 = (matches.sigma_m**2 + matches.bias_m**2)[facing]
-    cells = np.floor(point[:, :2] / point[:, 2:] / np.tan(CELL_RAD)).astype(int)
+    cells = np.floor(point[:, :2] / point[:, 2:] / np.tan(SMOOTH_RAD)).astype(int)
     _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     shared = SMOOTH_SHARE * np.abs((normal * point).sum(axis=1))
     sigma = np.sqrt(sigma2 + count[cell.ravel()] * shared**2)

@@ -16,8 +16,8 @@ from .observability import not_observable
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-DENSE = 6000
-"""Unknowns up to which the rest is solved densely (0.3 GB)."""
+DENSE = 4000
+"""Unknowns up to which the rest is solved densely (0.13 GB)."""
 DENSE_COUPLING = 0.05
 """Share of entries from which on a product of sparse matrices is slower than one of dense ones."""
 

@@ -18,6 +18,7 @@ _MISSING = {
     "p": "pick the point again from another place",
     "u": "see the pipe from another side",
     "v": "see the pipe from another side",
+    "w": "give the pipe's nominal diameter in the rig file",
     "r": "see both edges of the pipe, or give its nominal diameter in the rig file",
     "k": "give the camera's calibration smaller sigmas in the rig file, or freeze it",
     "e": "give the extrinsics smaller sigmas in the rig file, or freeze them",
@@ -65,7 +66,8 @@ def why_no_base(mount: Mount | None, board_known: bool) -> str:
         )
     if not board_known:
         return (
-            f"{{b}} is not observable: board {mount.board} was never seen well enough by the mobile camera; "
-            "record a view of the whole board from 1 to 1.5 m, or correct the marker ids in the rig file"
+            f"{{b}} is not observable: board {mount.board} was never seen well enough by the mobile camera, and Kinect "
+            "and mobile camera share too few textured surfaces; record a view of the whole board from 1 to 1.5 m, or "
+            "correct the marker ids in the rig file"
         )
     return "{b} is not observable: nothing ties the Kinect to the mobile camera"

@@ -1,7 +1,6 @@
 """Stereo visual odometry in the graph: keyframes, and the landmarks that tie them together."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -14,15 +13,15 @@ from ..factors.measurements import Rejection, StereoFrame
 from ..factors.noise import gaussian, robust
 from ..factors.projection import mobile_projection
 from .graph import Record, State, Update
+from .track_gate import FAMILY, Gate, Newest, TrackGate, residuals
 
 Float = NDArray[np.float64]
 
-FAMILY = "stereo odometry"
 
-AWAY = 3
-"""Keyframes without a view after which a landmark counts as having come back."""
-DRIFT_SAMPLE = 5
-"""Landmarks that tell how large a drift the graph thinks possible."""
+POOR_S = 0.1
+"""How long before they break tracks may have been wrong."""
+VIEWS_PASSED = 3
+"""Views of a track without a landmark that are kept beside its newest one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +31,7 @@ class OdometrySettings:
     tracks_per_keyframe: int = 90
     minimum_disparity_px: float = 1.0
     """Below it a point is too far for a first guess from stereo."""
-    gate_sigma: float = 6.0
-    gate_px: float = 2.0
-    """A track off by more than both of these from where the map says is not that landmark any more."""
+    gate: Gate = field(default_factory=Gate)
     minimum_shared: int = 12
     """Fewer landmarks shared with the map: a motion prior joins the keyframe to the last one."""
     lost_speed_m_s: float = 0.5
@@ -53,6 +50,10 @@ class FramePose:
     """Shape (4, 4)."""
 
 
+View = tuple[int, StereoFrame, int]
+"""Keyframe index, its frame, and a track's row in it."""
+
+
 class Odometry:
     """Turns stereo frames into keyframes and landmarks."""
 
@@ -60,7 +61,9 @@ class Odometry:
         self._state = state
         self._settings = settings
         self._robust_sigma = robust_sigma
-        self._waiting: dict[int, tuple[int, StereoFrame, int]] = {}
+        self._waiting: dict[int, View] = {}
+        self._passed: dict[int, list[View]] = {}
+        """Views of waiting tracks before the one that waits, the newest first: they did not agree with the next one."""
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
         self.seen_in: dict[int, int] = {}
@@ -69,19 +72,33 @@ class Odometry:
         """Number of keyframes in which each landmark was seen."""
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
+        self._held_ns = 0
+        """The last frame that the tracks held."""
+        self.gap_s = 0.0
+        """Time that the newest keyframe's motion prior alone bridges to those before; zero where landmarks do."""
         self._reference = -1
         """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
-        self.joint_covariance: Callable[[Sequence[int]], Float] | None = None
-        """Of the running solver; None refuses every landmark that comes back from far away."""
+        self.gate = TrackGate(state, settings.gate)
 
     @property
     def last_keyframe(self) -> int:
         """Index of the newest keyframe, -1 before the first."""
         return len(self.keyframe_stamps) - 1
 
+    @property
+    def lost_speed_m_s(self) -> float:
+        """Standard deviation of the velocity while nothing is tracked."""
+        return self._settings.lost_speed_m_s
+
+    def expected(self) -> gtsam.Pose3:
+        """Where the frame just followed stands, by its motion since the last keyframe."""
+        return self._guess_pose(len(self.keyframe_stamps))
+
     def follow(self, frame: StereoFrame) -> None:
         """Moves the camera by the front end's estimate; every frame passes here once, in order."""
-        if self.keyframe_stamps:
+        if not frame.lost:
+            self._held_ns = frame.stamp_ns
+        if self._reference >= 0:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
             self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last))
@@ -98,14 +115,16 @@ class Odometry:
         key = keys.keyframe(index)
         update.guess(key, pose)
         rejected: list[Rejection] = []
+        self.gap_s = 0.0
         known, new = self._split(frame)
         if index == 0:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
-            known, rejected = self._gated(frame, known, pose)
-            connected = self._state.has(keys.keyframe(self._reference))
-            if connected and (self._since_keyframe_lost or len(known) < self._settings.minimum_shared):
-                self._bridge(update, index, frame, pose)
+            known, rejected = self.gate.gated(frame, known, pose, self._newest())
+            connected = self._reference >= 0 and self._state.has(keys.keyframe(self._reference))
+            few = len(known) < self._settings.minimum_shared
+            if connected and (self._since_keyframe_lost or few):
+                self._bridge(update, index, frame, pose, few)
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self._create(update, frame, new, index, pose)
@@ -122,6 +141,7 @@ class Odometry:
     def forget(self, keyframes: set[int], landmarks: set[int]) -> None:
         """These have left the graph."""
         self._waiting = {t: w for t, w in self._waiting.items() if w[0] not in keyframes}
+        self._passed = {t: [v for v in w if v[0] not in keyframes] for t, w in self._passed.items()}
         self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
         self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
         self.frames = [f for f in self.frames if f.keyframe not in keyframes]
@@ -146,13 +166,16 @@ class Odometry:
         update = Update()
         update.guess(keys.keyframe(index), pose)
         known, _ = self._split(frame)
-        known, rejected = self._gated(frame, known, pose)
+        known, rejected = self.gate.gated(frame, known, pose, self._newest())
         if len(known) < self._settings.minimum_shared:
             return None
         for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self.keyframe_stamps.append(frame.stamp_ns)
         return update, rejected
+
+    def _newest(self) -> Newest:
+        return Newest(self._reference, self.seen_in, self._since_keyframe_lost)
 
     def _guess_pose(self, index: int) -> gtsam.Pose3:
         if index == 0:
@@ -170,94 +193,14 @@ class Odometry:
                 new.append(row)
         return known, new
 
-    def _gated(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[list[int], list[Rejection]]:
-        """Leaves out tracks that are far from where the map and the common shift of all tracks put them.
-
-        Landmarks that come back into view after a time show the drift since, which the living ones do not: they have
-        their own shift, and it has to be one that the drift can be.
-        """
-        newest = self._reference
-        ids = frame.track_ids
-        back = [r for r in rows if newest - self.seen_in.get(int(ids[r]), newest) >= AWAY]
-        living = sorted(set(rows) - set(back))
-        kept, rejected, shift = self._gated_together(frame, living, pose)
-        again, more, drift = self._gated_together(frame, back, pose)
-        excess = float(np.linalg.norm(drift - shift))
-        if again and not self._since_keyframe_lost and excess > self._settings.gate_px:
-            sigmas = self._drift_sigmas(frame, again, pose, shift)
-            if sigmas > self._settings.gate_sigma:
-                reason = "seen again, beyond what drift explains, sigmas"
-                more += [self._refused(frame, r, reason, sigmas, self._settings.gate_sigma) for r in again]
-                again = []
-        return kept + again, rejected + more
-
-    @staticmethod
-    def _refused(frame: StereoFrame, row: int, reason: str, value: float, limit: float) -> Rejection:
-        what = f"track {int(frame.track_ids[row])} in m_left"
-        return Rejection(frame.stamp_ns, FAMILY, what, reason, value, limit)
-
-    def _gated_together(
-        self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3
-    ) -> tuple[list[int], list[Rejection], Float]:
-        """Rows that have about the same residual, what does not, and that residual, px."""
-        if not rows:
-            return rows, [], np.zeros(2)
-        residual, front = self._residuals(frame, rows, pose)
-        shift = np.median(residual[front], axis=0) if front.any() else np.zeros(2)
-        distance = np.linalg.norm(residual - shift, axis=1)
-        spread = np.maximum(1.4826 * float(np.median(distance)), 0.0)
-        sigma = np.sqrt(np.trace(frame.left_covariance_px2[rows], axis1=1, axis2=2) / 2)
-        limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
-        good = front & (distance < limit)
-        rejected = [
-            self._refused(frame, r, "off its landmark by px", float(distance[i]), float(limit[i]))
-            for i, r in enumerate(rows)
-            if not good[i]
-        ]
-        return [r for i, r in enumerate(rows) if good[i]], rejected, shift
-
-    def _residuals(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3) -> tuple[Float, NDArray[np.bool_]]:
-        """Left pixels less those of the landmarks seen from a pose, (n, 2), and which are ahead of the camera."""
-        points = np.array([self._state.point(keys.landmark(int(frame.track_ids[r]))) for r in rows])
-        return self._residuals_of(frame, rows, points, pose)
-
-    def _residuals_of(
-        self, frame: StereoFrame, rows: list[int], points: Float, pose: gtsam.Pose3
-    ) -> tuple[Float, NDArray[np.bool_]]:
-        """The same for points (n, 3) in {o}."""
-        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
-        c_p = (points - pose.translation()) @ pose.rotation().matrix()
-        front = c_p[:, 2] > 0.05
-        px = (c_p @ K.T)[:, :2] / np.where(front, c_p[:, 2], 1.0)[:, None]
-        return frame.left_px[rows] - px, front
-
-    def _drift_sigmas(self, frame: StereoFrame, rows: list[int], pose: gtsam.Pose3, shift: Float) -> float:
-        """How far landmarks that came back are from where they should be, in sigmas of the graph's own joint.
-
-        The median over a few of them: they share the drift. What the living tracks show too is the pose's guess.
-        """
-        last = keys.keyframe(self._reference)
-        if self.joint_covariance is None or not self._state.has(last):
-            return float("inf")
-        to_last = self._state.pose(last).between(pose).inverse().AdjointMap()
-        K = self._state.intrinsics(keys.intrinsics("m_left")).K()
-        chosen = rows[:: max(len(rows) // DRIFT_SAMPLE, 1)]
-        residual = self._residuals(frame, chosen, pose)[0] - shift
-        found = []
-        for r, off in zip(chosen, residual, strict=True):
-            landmark = keys.landmark(int(frame.track_ids[r]))
-            x, y, z = c_p = pose.transformTo(self._state.point(landmark))
-            by_point = K[:2, :2] @ np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
-            by_pose = np.hstack([by_point @ gtsam.Rot3.Hat(c_p), -by_point]) @ to_last
-            J = np.hstack([by_pose, by_point @ pose.rotation().matrix().T])
-            covariance = J @ self.joint_covariance([last, landmark]) @ J.T + frame.left_covariance_px2[r]
-            found.append(np.sqrt(off @ np.linalg.solve(covariance, off)))
-        return float(np.median(found))
-
-    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3) -> None:
+    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3, few: bool) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
         earlier = keys.keyframe(self._reference)
         seconds = (frame.stamp_ns - self.keyframe_stamps[self._reference]) * 1e-9
+        if self._since_keyframe_lost:
+            # Up to the loss the front end has followed the motion; a frame or two more may have been poor already.
+            seconds = min(seconds, (frame.stamp_ns - self._held_ns) * 1e-9 + POOR_S)
+            self.gap_s = seconds if few else 0.0
         motion = self._state.pose(earlier).between(pose)
         factor = motion_prior(
             earlier,
@@ -295,16 +238,21 @@ class Odometry:
             if c_p is None or r not in agree:
                 continue
             track = int(frame.track_ids[r])
-            first_index, first_frame, first_row = self._waiting.pop(track)
+            self._waiting.pop(track)
+            self._passed.pop(track, None)
             update.guess(keys.landmark(track), pose.transformFrom(c_p))
-            self._observe(update, first_frame, first_row, first_index)
+            for earlier_index, earlier_frame, earlier_row in reversed(agree[r]):
+                self._observe(update, earlier_frame, earlier_row, earlier_index)
             self._observe(update, frame, r, index)
         for r in rows:
             track = int(frame.track_ids[r])
             if not update.values.exists(keys.landmark(track)):
+                if track in self._waiting:
+                    self._passed[track] = [self._waiting[track], *self._passed.get(track, [])][:VIEWS_PASSED]
                 self._waiting[track] = (index, frame, r)
         alive = {int(t) for t in frame.track_ids}
         self._waiting = {t: w for t, w in self._waiting.items() if t in alive or index - w[0] < 3}
+        self._passed = {t: views for t, views in self._passed.items() if t in self._waiting}
 
     def _create_from_before(self, update: Update, frame: StereoFrame, index: int, pose: gtsam.Pose3) -> None:
         """Landmarks from tracks that only the left image shows now: the keyframe that they wait in has seen both.
@@ -325,39 +273,51 @@ class Odometry:
         if not made:
             return
         rows = [r for r, _ in made]
-        residual, front = self._residuals_of(frame, rows, np.array([o_p for _, o_p in made]), pose)
+        residual, front = residuals(self._state, frame, rows, np.array([o_p for _, o_p in made]), pose)
         distance = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
-        limit = max(self._settings.gate_sigma * 1.4826 * float(np.median(distance)), self._settings.gate_px)
+        limit = max(self._settings.gate.sigma * 1.4826 * float(np.median(distance)), self._settings.gate.px)
         good = [i for i in range(len(rows)) if front[i] and distance[i] < limit]
         chosen = set(_spread(frame.left_px, [rows[i] for i in good], self._settings.tracks_per_keyframe))
         for r, o_p in made:
             if r in chosen:
                 track = int(frame.track_ids[r])
                 first_index, first, first_row = self._waiting.pop(track)
+                self._passed.pop(track, None)
                 update.guess(keys.landmark(track), o_p)
                 self._observe(update, first, first_row, first_index)
                 self._observe(update, frame, r, index)
 
-    def _agreeing(self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3) -> set[int]:
-        """Rows whose point, triangulated now, is also where the earlier keyframe saw it, left and right.
+    def _agreeing(
+        self, frame: StereoFrame, rows: list[int], points: list[Float | None], pose: gtsam.Pose3
+    ) -> dict[int, list[View]]:
+        """Rows whose point, triangulated now, is also where an earlier keyframe saw it, left and right; and its views.
 
         A landmark that starts from a wrong match can lie behind a camera, where its factors say nothing at all. What
         does not agree waits for another view. The median shift is taken out: it is the guess of the pose that is off.
         """
-        kept = [(r, c_p) for r, c_p in zip(rows, points, strict=True) if c_p is not None]
+        kept = [(r, pose.transformFrom(c_p)) for r, c_p in zip(rows, points, strict=True) if c_p is not None]
         if not kept:
-            return set()
-        off = np.array([self._earlier_residual(frame, r, pose.transformFrom(c_p)) for r, c_p in kept])
-        off = off - np.nanmedian(off, axis=0)
-        distance = np.linalg.norm(off.reshape(-1, 2, 2), axis=2).max(axis=1)
+            return {}
+        newest = [self._waiting[int(frame.track_ids[r])] for r, _ in kept]
+        off = np.array([self._earlier_residual(view, o_p) for view, (_, o_p) in zip(newest, kept, strict=True)])
+        shift = np.nanmedian(off, axis=0)
+        distance = np.linalg.norm((off - shift).reshape(-1, 2, 2), axis=2).max(axis=1)
         spread = 1.4826 * float(np.nanmedian(distance))
         sigma = np.array([np.sqrt(np.trace(frame.left_covariance_px2[r]) / 2) for r, _ in kept])
-        limit = np.maximum(self._settings.gate_sigma * np.hypot(sigma, spread), self._settings.gate_px)
-        return {r for (r, _), d, most in zip(kept, distance, limit, strict=True) if d < most}
+        limit = np.maximum(self._settings.gate.sigma * np.hypot(sigma, spread), self._settings.gate.px)
+        found: dict[int, list[View]] = {}
+        for (r, o_p), view, d, most in zip(kept, newest, distance, limit, strict=True):
+            views = [view] if d < most else []
+            for passed in self._passed.get(int(frame.track_ids[r]), []):
+                off_px = (self._earlier_residual(passed, o_p) - shift).reshape(2, 2)
+                views += [passed] if np.linalg.norm(off_px, axis=1).max() < most else []
+            if views:
+                found[r] = views
+        return found
 
-    def _earlier_residual(self, frame: StereoFrame, row: int, o_p: Float) -> Float:
-        """Pixels of the waiting keyframe less those of a point, left then right, shape (4,); NaN behind a camera."""
-        index, earlier, earlier_row = self._waiting[int(frame.track_ids[row])]
+    def _earlier_residual(self, view: View, o_p: Float) -> Float:
+        """Pixels of a keyframe less those of a point, left then right, shape (4,); NaN behind a camera."""
+        index, earlier, earlier_row = view
         o_T_left = self._state.pose(keys.keyframe(index))
         o_T_right = o_T_left.compose(self._state.pose(keys.extrinsics("m_right")))
         residual = np.full(4, np.nan)

@@ -1,5 +1,7 @@
 """The graph while it grows: what is believed, what waits for the solver, and the solver."""
 
+import gtsam
+
 from .graph import State, Update
 from .incremental import Incremental
 
@@ -31,3 +33,7 @@ class OpenGraph:
         update, self._pending = self._pending, Update()
         self.state.values = self.solver.update(update)
         return True
+
+    def relocate(self, values: gtsam.Values) -> None:
+        """Other values, from which the solver begins anew at the next update; nothing may be waiting."""
+        self.state.values = self.solver.relocate(values)

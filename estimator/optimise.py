@@ -11,9 +11,7 @@ from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
 from ..io.ordering import OrderReport
 from ..io.reader import LogReader
-from .pipeline import Pipeline
 from .result import Result
-from .run import finish
 from .sensed_log import SensedLog, opened
 from .stopwatch import Stopwatch
 
@@ -56,33 +54,49 @@ def optimise(
     watch = Stopwatch()
     with LogReader(log) as reader:
         rig = rig_of(reader, rig_file)
-    pipeline = Pipeline(rig)
     with opened(log, rig, processes) as recording, told_of(log, recording):
+        from .depth_run import depth_alone, depth_result  # the graph's libraries load while the front ends start
+        from .pipeline import Pipeline
+        from .run import finish
+
+        pipeline = Pipeline(rig)
         with watch("run"):
             for stamp_ns in pipeline.run(recording):
                 if progress is not None:
                     progress(stamp_ns)
             report = recording.report
-            pipeline.check(report.sensing)
+            provenance = _provenance(log, rig, report.sha256, command)
+            alone = depth_alone(pipeline.engine, report.sensing)
+            if not alone:
+                pipeline.check(report.sensing)
+        odd = [
+            *_damage(report.warnings, pipeline.engine.end_ns),
+            *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
+        ]
+        if alone:
+            return depth_result(log, rig, watch.seconds, provenance, odd)
         with watch("refine"):
             return finish(
                 pipeline.engine,
                 between,
                 watch.seconds,
-                {
-                    "surecut": version("surecut"),
-                    "gtsam": version("gtsam"),
-                    "log": log.name,
-                    "log_sha256": report.sha256,
-                    "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
-                    "command": command,
-                },
+                provenance,
                 report.sensing.rejected,
-                [
-                    *_damage(report.warnings, pipeline.engine.end_ns),
-                    *odd_stamps(report.sensing.order, rig, pipeline.engine.end_ns),
-                ],
+                odd,
+                memory=True,
             )
+
+
+def _provenance(log: Path, rig: Rig, sha256: str, command: str) -> dict[str, str]:
+    """What made the result, of what."""
+    return {
+        "surecut": version("surecut"),
+        "gtsam": version("gtsam"),
+        "log": log.name,
+        "log_sha256": sha256,
+        "rig_sha256": hashlib.sha256(dump_rig(rig).encode()).hexdigest(),
+        "command": command,
+    }
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import predict_outline
 from ..frontends.pipe.silhouette import OutlineFinder
 from .engine import Engine
-from .pipes import AXIS_ROLES
+from .pipes import AXIS_ROLES, INSET_SHARE
 from .sensors import PairImages
 
 Float = NDArray[np.float64]
@@ -23,8 +23,11 @@ OUTLINE_VIEWS = 16
 """Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.006, 0.02, 0.004)
-"""Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for."""
+OUTLINE_PRIOR = (0.006, 0.02)
+"""Sigmas of axis [m] and direction [rad] with which a known pipe's outline is looked for."""
+EDGE_PX = 1.0
+"""A radius that was read from edges is known to so many pixels at the pipe's range, and to what its finish hides (see
+`pipes.INSET_SHARE`): the width of a known pipe's outline is looked for within both."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
 
@@ -44,7 +47,7 @@ class OutlineSearch:
         """A keyframe's pictures, and the clicks in them."""
         self._kept.append(pair)
         self._kept_bytes += pair.nbytes
-        while self._kept_bytes > KEPT_BYTES:
+        while self._kept_bytes > KEPT_BYTES or self._kept[0].stamp_ns not in self._engine.keyframe_at:
             self._kept_bytes -= self._kept.popleft().nbytes
         for pick in picks:
             if pick.role in AXIS_ROLES and pick.camera in MOBILE:
@@ -82,7 +85,10 @@ class OutlineSearch:
             return
         ends = _part_of_axis(self._engine.pipes.places(pipe), axis)
         a, b = (where.o_T_c.transformTo(end) for end in ends)
-        prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
+        model = self._engine.cameras[camera]
+        range_m = max(0.5 * float(a[2] + b[2]), 0.1)
+        width = float(np.hypot(EDGE_PX * range_m / model.fx, INSET_SHARE * axis[2]))
+        prior = predict_outline(model, a, b, axis[2], *OUTLINE_PRIOR, width)
         if prior is not None:
             looked[pair.stamp_ns] = place
             self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))

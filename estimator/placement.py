@@ -87,7 +87,7 @@ def _chi2(
             return float("inf"), float("inf")
         image = local @ state.intrinsics(keys.intrinsics(camera)).K().T
         residual = image[:, :2] / image[:, 2:] - px
-        information = np.linalg.inv(np.concatenate([s.covariance_px2 for s in seen]))
+        information = np.linalg.inv(np.concatenate([s.covariance_px2[s.good] for s in seen]))
         total += float(np.einsum("ni,nij,nj->", residual, information, residual))
         errors.append(np.linalg.norm(residual, axis=1))
     return total, float(np.median(np.concatenate(errors)))

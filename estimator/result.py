@@ -230,3 +230,6 @@ class Result:
     surroundings: SurfaceMap | None = None
     motions: tuple[MotionEstimate, ...] = ()
     """Of the mobile camera, over windows of a second."""
+    memory: str = ""
+    """What a later run may begin with (`surecut stream --prior`): boards, machine, calibration, pipes and points with
+    their joint covariance, as the text of a checkpoint; empty where no board is known."""

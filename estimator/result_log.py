@@ -47,14 +47,17 @@ def write_result(path: Path, result: Result) -> None:
 
 def _write_poses(sink: McapSink, result: Result) -> None:
     start = result.trajectory[0].stamp_ns if result.trajectory else result.end_ns
-    static = [(start, "o", p.name, p.matrix) for p in result.poses if p.name != "m"]
+    moving = {"m", *(p.name for p in result.trajectory)}
+    static = [(start, "o", p.name, p.matrix) for p in result.poses if p.name not in moving]
     if static:
         sink.write("/tf_static", "tf2_msgs/msg/TFMessage", tf_message(static), start)
     for pose in result.poses:
-        if pose.name != "m":
+        if pose.name not in moving:
             _write_pose(sink, pose, start)
     for pose in result.trajectory:
-        sink.write("/tf", "tf2_msgs/msg/TFMessage", tf_message([(pose.stamp_ns, "o", "m", pose.matrix)]), pose.stamp_ns)
+        sink.write(
+            "/tf", "tf2_msgs/msg/TFMessage", tf_message([(pose.stamp_ns, "o", pose.name, pose.matrix)]), pose.stamp_ns
+        )
         _write_pose(sink, pose, pose.stamp_ns)
 
 

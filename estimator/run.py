@@ -1,12 +1,13 @@
 """Measurements to result: the one loop, its end, and the batch refinement."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from ..factors.camera import CameraModel
 from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, Rejection
-from ..factors.rig import Rig
-from .batch import solve
+from ..factors.rig import Rig, sha256_of
+from .batch import BatchSolution, solve
 from .board_faults import settle_boards
 from .bundle import bundles
 from .engine import Engine
@@ -24,8 +25,12 @@ def finish(
     provenance: Mapping[str, str] | None = None,
     rejected: Sequence[Rejection] = (),
     events: Sequence[Event] = (),
+    memory: bool = False,
 ) -> Result:
     """Settles iSAM2, refines in batch over the same factors, and reads the result.
+
+    Args:
+        memory: a later run may begin with the result.
 
     Raises:
         ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
@@ -43,7 +48,15 @@ def finish(
     engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events
-    return Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))
+    result = Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))
+    return replace(result, memory=_memory(engine, solution)) if memory else result
+
+
+def _memory(engine: Engine, solution: BatchSolution) -> str:
+    from .stream.memory import remember, to_json  # which is only wanted for recordings
+
+    found = remember(engine, solution)
+    return "" if found is None else to_json(found, sha256_of(engine.rig))
 
 
 def estimate(

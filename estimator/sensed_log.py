@@ -1,23 +1,27 @@
-"""A recording as the front ends see it: read in this process, or in one of its own while the graph is being solved."""
+"""A recording as the front ends see it: read in this process, or in one of its own while the graph is being solved.
+
+The front ends' libraries take a second to load. They are imported where they run, so that the other process can start
+before this one has loaded the graph's.
+"""
 
 import multiprocessing
 import queue
 import traceback
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
-
-import cv2
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
-from .executor import single_threaded_children
-from .sensing import Sensed, Sensing, SensingReport, wanted_topics
+from .threads import single_threaded_children
+
+if TYPE_CHECKING:
+    from .sensing import Sensed, SensingReport
 
 AHEAD = 64
 """Stamps that the front ends may be ahead of the graph: what bounds the memory."""
@@ -28,10 +32,17 @@ POLL_S = 1.0
 class RecordingReport:
     """What can be said of a recording once it has been read."""
 
-    sensing: SensingReport = field(default_factory=SensingReport)
+    sensing: "SensingReport"
     warnings: tuple[str, ...] = ()
     """Damage, one line each."""
     sha256: str = ""
+
+    @classmethod
+    def empty(cls) -> "RecordingReport":
+        """Of a recording of which nothing has been read."""
+        from .sensing import SensingReport
+
+        return cls(SensingReport())
 
 
 class SensedLog(Protocol):
@@ -40,7 +51,7 @@ class SensedLog(Protocol):
     @property
     def report(self) -> RecordingReport: ...
 
-    def __iter__(self) -> Iterator[Sensed]: ...
+    def __iter__(self) -> Iterator["Sensed"]: ...
 
 
 def opened(log: Path, rig: Rig, processes: int = 1) -> "AbstractContextManager[SensedLog]":
@@ -52,6 +63,9 @@ class SensedHere:
     """Front ends in this process."""
 
     def __init__(self, log: Path, rig: Rig) -> None:
+        from .items import wanted_topics
+        from .sensing import Sensing
+
         self._reader = LogReader(log, wanted_topics(rig))
         self._sensing = Sensing(rig)
         self._sha256 = ""
@@ -60,7 +74,7 @@ class SensedHere:
     def report(self) -> RecordingReport:
         return RecordingReport(self._sensing.report(), tuple(self._reader.warnings), self._sha256)
 
-    def __iter__(self) -> Iterator[Sensed]:
+    def __iter__(self) -> Iterator["Sensed"]:
         yield from self._sensing.run(self._reader)
         self._sha256 = self._reader.sha256()
 
@@ -85,10 +99,14 @@ class SensedElsewhere:
     """Front ends in a process of their own, a bounded number of stamps ahead."""
 
     def __init__(self, log: Path, rig: Rig) -> None:
-        self.report = RecordingReport()
+        self._report: RecordingReport | None = None
         self._log, self._rig = log, rig
         self._process: BaseProcess | None = None
         self._queue: Any = None
+
+    @property
+    def report(self) -> RecordingReport:
+        return self._report or RecordingReport.empty()
 
     def __enter__(self) -> Self:
         context = multiprocessing.get_context("spawn")
@@ -104,20 +122,20 @@ class SensedElsewhere:
             self._process.join()
             self._queue.close()
 
-    def __iter__(self) -> Iterator[Sensed]:
+    def __iter__(self) -> Iterator["Sensed"]:
         """
         Raises:
             SurecutError: what the front ends found wrong, or their process was killed.
         """
         while not isinstance(item := self._next(), _End):
             yield item
-        self.report = item.report
+        self._report = item.report
         if item.error is not None:
             raise item.error
         if item.defect is not None:
             raise RuntimeError(item.defect)
 
-    def _next(self) -> Sensed | _End:
+    def _next(self) -> "Sensed | _End":
         assert self._process is not None
         while True:
             try:
@@ -132,6 +150,8 @@ class SensedElsewhere:
 
 def _sense(log: Path, rig: Rig, out: Any) -> None:
     """The process: reads, senses, and hands over what it saw or what went wrong."""
+    import cv2
+
     cv2.setNumThreads(1)  # the graph has the other core
     here = SensedHere(log, rig)
     try:

@@ -1,6 +1,6 @@
 """Messages to measurements: the front ends' half of the loop. It knows no graph, so it can run in another process."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeGuard
 
@@ -17,15 +17,9 @@ from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .bundle import Bundle
 from .depth_sensor import DepthView
+from .items import COLOUR_PERIOD_NS, Item, plain
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
-
-Item = Message | StereoPair
-Tracked = Callable[[StereoFrame], object]
-
-COMPRESSED = "/compressed"
-COLOUR_PERIOD_NS = 1_000_000_000
-"""Boards in the Kinect's colour image: once a second is enough for a machine that stands still."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +49,8 @@ class SensingReport:
     pairing: PairingReport = field(default_factory=PairingReport)
     rejected: tuple[Rejection, ...] = ()
     """What the front ends themselves refused."""
-
-
-def wanted_topics(rig: Rig) -> frozenset[str]:
-    """The topics that the estimator reads; never the truth."""
-    topics = {rig.picks_topic, rig.kinect.points_topic}
-    for name in ("m_left", "m_right", "b_rgb", "b_depth"):
-        camera = getattr(rig.cameras, name)
-        topics |= {camera.image_topic, camera.image_topic + COMPRESSED, camera.info_topic}
-        if camera.markers_topic:
-            topics.add(camera.markers_topic)
-    return frozenset(topics)
+    depths: int = 0
+    """Depth images and clouds."""
 
 
 class Sensing:
@@ -82,6 +67,7 @@ class Sensing:
         """Cameras whose calibration has been handed on."""
         self._started = False
         """The first pair is a keyframe whatever it shows."""
+        self._depths_seen = 0
         self._last_colour_ns: int | None = None
         self._colour: ImageBody | None = None
         """The Kinect's newest colour image, not decoded."""
@@ -97,19 +83,35 @@ class Sensing:
         left, right = self.rig.cameras.m_left.image_topic, self.rig.cameras.m_right.image_topic
         return _same_stamp(stereo_pairs(ordered, left, right, report=self._pairing))
 
-    def process(self, group: list[Item], tracked: Tracked | None = None) -> Sensed:
-        """All messages of one stamp.
+    def process(self, group: list[Item]) -> Sensed:
+        """All messages of one stamp."""
+        return self.look(group, self.follow(group))
+
+    def follow(self, group: list[Item]) -> StereoFrame | None:
+        """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
+
+        Raises:
+            LogError: the pair cannot be used.
+        """
+        self.calibrate(group)
+        pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
+        return self.sensors.track(pair) if pair is not None else None
+
+    def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
+        """Everything else that a group shows.
 
         Args:
-            tracked: told of the frame's motion at once, before anything else is looked for.
+            frame: what `follow`, of this object or another, has said of the pair.
+
+        Raises:
+            LogError: a part of it cannot be used.
         """
         stamp_ns = _stamp(group[0])
         self.calibrate(group)
-        pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
+        pair = None
+        if frame is not None:
+            pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
         picks = tuple(self._pick(i) for i in group if isinstance(i, Message) and isinstance(i.body, PickBody))
-        frame = self.sensors.track(pair) if pair is not None else None
-        if frame is not None and tracked is not None:
-            tracked(frame)
         kept = pair if frame is not None and (frame.is_keyframe or picks or not self._started) else None
         self._started |= frame is not None
         sightings = self._sightings(stamp_ns, group, kept)
@@ -147,7 +149,7 @@ class Sensing:
 
     def report(self) -> SensingReport:
         """What was odd, and what was refused, so far."""
-        return SensingReport(self._order, self._pairing, tuple(self.sensors.rejected))
+        return SensingReport(self._order, self._pairing, tuple(self.sensors.rejected), self._depths_seen)
 
     def calibrate(self, group: list[Item]) -> None:
         """Calibrations among the messages open their cameras."""
@@ -198,8 +200,10 @@ class Sensing:
                 continue
             if isinstance(item.body, DepthBody) and item.topic == self.rig.cameras.b_depth.image_topic:
                 view = self.sensors.depth(stamp_ns, item.body.depth_m()) or view
+                self._depths_seen += 1
             if isinstance(item.body, CloudBody) and item.topic == self.rig.kinect.points_topic:
                 view = kinect.cloud(stamp_ns, item.body.points_m()) if kinect.cloud_due(stamp_ns) else view
+                self._depths_seen += 1
         if view is None or self._colour is None:
             return view
         return replace(view, colour=grey(self._colour.pixels()))
@@ -232,14 +236,6 @@ def images(pair: StereoPair) -> PairImages:
 def grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """One channel, shape (height, width)."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def plain(message: Message) -> Message:
-    """A compressed topic counts as its raw one."""
-    if not message.topic.endswith(COMPRESSED):
-        return message
-    topic = message.topic.removesuffix(COMPRESSED)
-    return Message(topic, message.log_time_ns, message.stamp_ns, message.frame_id, message.body)
 
 
 def _stamp(item: Item) -> int:

@@ -14,6 +14,7 @@ from ..factors.measurements import Event
 from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
+from .agreement import cloud_event
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
 from .calibration_rows import calibration_rows
@@ -266,16 +267,22 @@ class Summary:
         priors = prior_tests(self._active, self._system, tested)
         paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
         cylinders, ways = compared_with_cloud(self._engine, self._active, self._system, self._values)
-        return judge(families, [*priors, *cylinders], {**paths, **ways, **self._left_out()})
+        without = self._left_out()
+        if (told := cloud_event(without, self._engine.end_ns)) is not None and "mount_wrong" not in self._told():
+            self._engine.events.append(told)
+        moved = {f"{point} without {family}": sigma for (point, family), sigma in without.items()}
+        return judge(families, [*priors, *cylinders], {**paths, **ways, **moved})
 
-    def _left_out(self) -> dict[str, float]:
+    def _told(self) -> set[str]:
+        return {event.kind for event in self._engine.events}
+
+    def _left_out(self) -> dict[tuple[str, str], float]:
         """How far each point moves without one family of measurements, in sigmas."""
         known = [p for p in self._engine.pipes.points.values() if p.known]
         if not known or not self._values.exists(self._engine.base):
             return {}
         blocks = {p.id: point_blocks(self._values, self._engine.base, keys.point(p.index))[1] for p in known}
-        found = without_families(self._active, self._system, blocks, LEFT_OUT)
-        return {f"{point} without {family}": sigma for (point, family), sigma in found.items()}
+        return without_families(self._active, self._system, blocks, LEFT_OUT)
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""

@@ -13,6 +13,7 @@ _WORDS = {
     "u": "pipe axis, first point of pipe {}",
     "v": "pipe axis, second point of pipe {}",
     "r": "radius of pipe {}",
+    "w": "how far the visible edges of pipe {} lie inside its outline",
     "k": "intrinsics of camera {}",
     "e": "camera extrinsics {}",
     "g": "centre and focal length of the Kinect's depth camera",
@@ -76,6 +77,11 @@ def axis_end(pipe: int) -> int:
 def radius(pipe: int) -> int:
     """A pipe's radius [m]: Vector1."""
     return gtsam.symbol("r", pipe)
+
+
+def inset(pipe: int) -> int:
+    """How far the visible edges of a pipe lie inside its outline [m]: Vector1."""
+    return gtsam.symbol("w", pipe)
 
 
 CAMERA_INDEX = {"m_left": 0, "m_right": 1, "b_rgb": 2}

@@ -35,6 +35,19 @@ class MarkerSighting:
     common_px: float | None = None
     """Sigma of the part of it that views from the same place have in common, where the front end knows; the rig's
     `marker_common_px` is the least."""
+    gross: tuple[int, ...] = ()
+    """Corners that contradict the rest of their board: they are not used."""
+
+    @property
+    def good(self) -> Int:
+        """The corners that are used, in order."""
+        return np.setdiff1d(np.arange(4), np.array(self.gross, dtype=np.int64))
+
+    @property
+    def diagonal_px(self) -> float:
+        """Length of the marker's diagonal, from corners that are used where they span one."""
+        spans = [(a, b) for a, b in ((0, 2), (1, 3)) if not {a, b} & set(self.gross)] or [(0, 2), (1, 3)]
+        return float(np.mean([np.linalg.norm(self.corners_px[a] - self.corners_px[b]) for a, b in spans]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float
 
 
 def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int) -> gtsam.CustomFactor:
-    """One edge of a pipe in one image.
+    """One edge of a pipe in one image. It lies inside the true outline by the pipe's inset.
 
     Args:
         camera: `m_left`, `m_right` or `b_rgb`.
@@ -87,16 +87,17 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
         pipe: index of the pipe.
     """
     variables = [pose, keys.intrinsics(camera), keys.axis_start(pipe), keys.axis_end(pipe), keys.radius(pipe)]
+    variables.append(keys.inset(pipe))
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
-        c_T_s = values.atPose3(variables[5]) if len(variables) == 6 else None
+        c_T_s = values.atPose3(variables[6]) if len(variables) == 7 else None
         K = values.atCal3DS2(variables[1]).K()
         seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
-        radius = float(values.atVector(variables[4])[0])
-        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], radius)
+        visible = float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible)
         if jacobians is not None:
             d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
             jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
@@ -105,8 +106,9 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
             jacobians[2] = d_a @ seen[0][2]
             jacobians[3] = d_b @ seen[1][2]
             jacobians[4] = d_shape[:, 6:]
+            jacobians[5] = -d_shape[:, 6:]
             if c_T_s is not None:
-                jacobians[5] = d_a @ seen[0][3] + d_b @ seen[1][3]
+                jacobians[6] = d_a @ seen[0][3] + d_b @ seen[1][3]
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
@@ -154,6 +156,11 @@ def axis_gauge(
 def radius_prior(pipe: int, radius_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
     """Half the nominal diameter, or a wide prior that says only what pipes there are."""
     return gtsam.PriorFactorVector(keys.radius(pipe), np.array([radius_m]), sigmas([sigma_m]))
+
+
+def inset_prior(pipe: int, sigma_m: float) -> gtsam.NonlinearFactor:
+    """What is known of an inset: images alone cannot tell it from a thinner pipe."""
+    return gtsam.PriorFactorVector(keys.inset(pipe), np.zeros(1), sigmas([sigma_m]))
 
 
 def across_axis(direction: Float) -> Float:

@@ -4,6 +4,7 @@
 pixels in OpenCV's convention. Poses are `a_T_b`: the pose of b in a.
 """
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -251,6 +252,11 @@ def load_rig(source: Path | str | bytes, name: str | None = None) -> Rig:
         return Rig.model_validate(data)
     except ValidationError as error:
         raise RigError(f"{label}: {_one_line(error)}") from error
+
+
+def sha256_of(rig: "Rig") -> str:
+    """Tells rigs apart."""
+    return hashlib.sha256(dump_rig(rig).encode()).hexdigest()
 
 
 def dump_rig(rig: Rig) -> str:

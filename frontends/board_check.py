@@ -12,7 +12,7 @@ from ..factors.camera import CameraModel
 from ..factors.chance import chi2_isf
 from ..factors.measurements import MarkerSighting
 from ..factors.rig import Board, Noise
-from .board_fit import BoardFit, board_corners, fit_board
+from .board_fit import BoardCorners, BoardFit, board_corners, fit_board
 from .board_pose import board_pose_candidates
 
 Float = NDArray[np.float64]
@@ -43,6 +43,8 @@ class Suspicion:
     limit: float
     other: int | None = None
     """The id that it was exchanged with."""
+    explained: bool = True
+    """False: shift and turn do not explain where its corners are, so that it is the corners that are wrong."""
 
 
 def suspicious_markers(
@@ -99,7 +101,7 @@ def _worst(
     if best is None:
         return None, 0
     _, k, fit = best
-    suspicion = _suspicion(sightings[k].marker, fit, board)
+    suspicion = _suspicion(sightings[k].marker, fit, board, _explains(fit, corners, k))
     return (suspicion if suspicion.chi2 > suspicion.limit else None), k
 
 
@@ -119,7 +121,17 @@ def _fit(
     return (min(fits, key=lambda fit: fit.chi2) if fits else None), poses
 
 
-def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
+def _explains(fit: BoardFit, corners: BoardCorners, k: int) -> bool:
+    """Are the corners of the marker that was let free as near to the fit as the others are?"""
+    white = np.linalg.solve(np.linalg.cholesky(corners.covariance_px2), fit.residual_px[..., None])[..., 0]
+    squares, own = (white**2).sum(axis=1), corners.marker == k
+    rest = 2 * int((~own).sum()) - 6
+    scale = max(1.0, float(squares[~own].sum()) / rest) if rest > 0 else 1.0
+    dof = 2 * int(own.sum()) - _SHIFT_DOF
+    return dof > 0 and float(squares[own].sum()) < scale * chi2_isf(_FALSE_ALARM, dof)
+
+
+def _suspicion(marker: int, fit: BoardFit, board: Board, explained: bool) -> Suspicion:
     """The shift against its covariance, to which the board's own tolerance is added."""
     tolerance = np.diag([board.centre_sigma_m**2] * 2 + [(board.centre_sigma_m / board.side_m) ** 2])
     covariance = fit.covariance[6:, 6:] + 2 * tolerance
@@ -135,6 +147,7 @@ def _suspicion(marker: int, fit: BoardFit, board: Board) -> Suspicion:
         float(np.sqrt(covariance[2, 2])),
         float(fit.extra @ np.linalg.solve(covariance, fit.extra)),
         chi2_isf(_FALSE_ALARM, _SHIFT_DOF),
+        explained=explained,
     )
 
 

@@ -64,21 +64,22 @@ class BoardFit:
 
 
 def board_corners(sightings: Sequence[MarkerSighting], board: Board, common_px: float) -> BoardCorners:
-    """The corners of sightings of `board`, in one image; `common_px` as in `corner_covariance`."""
+    """The corners of sightings of `board` that are used, in one image; `common_px` as in `corner_covariance`."""
     places = {marker.id: marker for marker in board.markers}
     index, centres, offsets = [], [], []
     for k, sighting in enumerate(sightings):
         place = places[sighting.marker]
         c, s = np.cos(place.rotation_rad), np.sin(place.rotation_rad)
-        index += [k] * 4
-        centres += [place.centre_m] * 4
-        offsets.append(UNIT_SQUARE @ np.array([[c, s], [-s, c]]))
-    covariance = np.concatenate([corner_covariance(s, common_px) for s in sightings])
+        good = sighting.good
+        index += [k] * len(good)
+        centres += [place.centre_m] * len(good)
+        offsets.append(UNIT_SQUARE[good] @ np.array([[c, s], [-s, c]]))
+    covariance = np.concatenate([corner_covariance(s, common_px)[s.good] for s in sightings])
     return BoardCorners(
         np.array(index),
         np.array(centres, float),
         np.concatenate(offsets),
-        np.concatenate([s.corners_px for s in sightings]),
+        np.concatenate([s.corners_px[s.good] for s in sightings]),
         covariance,
     )
 

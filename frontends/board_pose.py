@@ -56,7 +56,7 @@ def board_pose_candidates(
         common_px: error that views from the same place share, added to each corner's own.
     """
     corners = board_corners(sightings, board, common_px)
-    fits = [fit_board(corners, camera, start, side_m) for start in _planar_poses(corners, camera, side_m)]
+    fits = [fit_board(corners, camera, start, side_m) for start in planar_poses(corners, camera, side_m)]
     fits = _distinct([fit for fit in fits if np.isfinite(fit.chi2)])
     if not fits:
         return []
@@ -92,7 +92,7 @@ def apparent_side(
     best_side = board.side_m
     for factor in _SIDE_FACTORS:
         side = float(board.side_m * factor)
-        for start in _planar_poses(corners, camera, side):
+        for start in planar_poses(corners, camera, side):
             fit = fit_board(corners, camera, start, side)
             if best is None or fit.chi2 < best.chi2:
                 best, best_side = fit, side
@@ -103,8 +103,10 @@ def apparent_side(
     return float(free.extra[0]), float(np.sqrt(free.covariance[6, 6] * scale))
 
 
-def _planar_poses(corners: BoardCorners, camera: CameraModel, side_m: float) -> list[Float]:
-    """Both start poses, those in front of the camera and facing it."""
+def planar_poses(corners: BoardCorners, camera: CameraModel, side_m: float) -> list[Float]:
+    """Both start poses, those in front of the camera and facing it; none from fewer than four corners."""
+    if len(corners.px) < 4:
+        return []
     page = corners.page_m(side_m)
     count, rotations, translations, _ = cv2.solvePnPGeneric(
         page, np.ascontiguousarray(corners.px), camera.K, None, flags=cv2.SOLVEPNP_IPPE

@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 
 from ..estimator.compare import chain_of_messages
+from ..estimator.items import wanted_topics
 from ..estimator.optimise import optimise, rig_of
-from ..estimator.sensing import wanted_topics
 from ..estimator.stopwatch import Stopwatch
 from ..factors.errors import LogError, SurecutError
 from ..io.messages import PointsBody, PoseBody

@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..estimator.validated_range import LEAST_COVERAGE, QUANTITIES, ValidatedRange
 from ..factors.errors import SurecutError
 from .campaign_row import Row, quantities_of
 
 DOCUMENT = "docs/validation.md"
+CENTRAL = 0.98
+"""Share of the runs that a range spans: a single run that went poorly must not widen what counts as tested."""
 FEWEST_RUNS = 40
 """Below it the coverage is not known to a few per cent."""
 
@@ -42,6 +46,9 @@ def validated_range(rows: Sequence[Row], level: str, stamp: str) -> ValidatedRan
 
 
 def _spread(rows: Sequence[Row], name: str) -> tuple[float, float] | None:
-    """Smallest and largest value; None where no run has it."""
+    """What the central `CENTRAL` of the runs covered; None where no run has it."""
     values = [one[name] for row in rows for one in row["covered"] if one.get(name) is not None]
-    return (float(f"{min(values):.4g}"), float(f"{max(values):.4g}")) if values else None
+    if not values:
+        return None
+    low, high = np.quantile(values, [(1 - CENTRAL) / 2, (1 + CENTRAL) / 2])
+    return float(f"{low:.4g}"), float(f"{high:.4g}")

@@ -16,6 +16,7 @@ import numpy as np
 from .campaign import write_whole
 from .campaign_decisions import Decisions, summarise_decisions
 from .campaign_row import Row, quantities_of
+from .evaluate import Quantity
 from .evaluate_summary import Coverage, Summary, clopper_pearson, summarise
 
 
@@ -39,6 +40,25 @@ class LeftOut:
     failed: int
     mean_error_ratio: float
     mean_radius_ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """The points against those of another campaign, over the runs that both have: the same seeds, the same scenes."""
+
+    name: str
+    runs: int
+    mean_m: float
+    other_mean_m: float
+    coverage95: float
+    other_coverage95: float
+    nees_per_dof: float
+    other_nees_per_dof: float
+
+    @property
+    def ratio(self) -> float:
+        """Of the mean errors."""
+        return self.mean_m / self.other_mean_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +90,16 @@ class CampaignTable:
     of variable: mean and worst run."""
     sensitivity_m: dict[str, tuple[float, float]] = field(default_factory=dict)
     """How far the points move for an input error: mean and worst."""
+    compared: Compared | None = None
 
 
-def tabulate(rows: Sequence[Row]) -> CampaignTable:
-    """All rows of a campaign in one table."""
+def tabulate(rows: Sequence[Row], other: tuple[str, Sequence[Row]] | None = None) -> CampaignTable:
+    """All rows of a campaign in one table.
+
+    Args:
+        rows: the runs.
+        other: name and rows of another campaign with the same seeds, to compare with.
+    """
     good = [row for row in rows if row["status"] == "done"]
     passed = sum(row["consistent"] for row in good)
     chain = [error for row in good for error in row["chain"]]
@@ -107,6 +133,34 @@ def tabulate(rows: Sequence[Row]) -> CampaignTable:
         sensitivity_m=_mean_and_worst(
             [{one["input"]: one["moved_m"]} for row in good for one in row.get("sensitivity", ())]
         ),
+        compared=None if other is None else _compared(rows, *other),
+    )
+
+
+def _compared(rows: Sequence[Row], name: str, others: Sequence[Row]) -> Compared | None:
+    """None where no run is in both."""
+    mine, theirs = (_points_by_run(some) for some in (rows, others))
+    both = sorted(set(mine) & set(theirs))
+    if not both:
+        return None
+    error, coverage, nees = zip(*(_figures(some, both) for some in (mine, theirs)), strict=True)
+    return Compared(name, len(both), *error, *coverage, *nees)
+
+
+def _points_by_run(rows: Sequence[Row]) -> dict[int, list[Quantity]]:
+    found = {
+        row["run"]: [q for q in quantities_of(row) if q.group == "point"] for row in rows if row["status"] == "done"
+    }
+    return {run: points for run, points in found.items() if points}
+
+
+def _figures(points_by_run: dict[int, list[Quantity]], runs: Sequence[int]) -> tuple[float, float, float]:
+    """Mean error, coverage of the 95 % region and NEES / dof of some runs' points."""
+    points = [point for run in runs for point in points_by_run[run]]
+    return (
+        float(np.mean([point.error for point in points])),
+        float(np.mean([point.probability <= 0.95 for point in points])),
+        float(np.mean([point.nees / point.dof for point in points])),
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from .campaign import write_whole
 from .campaign_decisions import decisions_text
 from .campaign_report import label, quantity_text
-from .campaign_table import CampaignTable
+from .campaign_table import CampaignTable, Compared
 
 TITLE = "# Validation"
 INTRODUCTION = """
@@ -55,6 +55,8 @@ def validation_section(table: CampaignTable) -> str:
         sizes = (table.chain.mean, table.chain.percentile95, table.chain.worst)
         cells = " | ".join(quantity_text(size, "m") for size in sizes)
         lines.append(f"| the paper's chain, {table.chain.count} clicks | {cells} | | | | |")
+    if table.compared is not None:
+        lines += ["", *compared_lines(table.compared)]
     families = ", ".join(f"{family} {value:.2f}" for family, value in table.chi2_per_dof.items())
     lines += ["", f"chi2/dof by family: {families}."]
     if table.streaming_sigma:
@@ -77,6 +79,19 @@ def validation_section(table: CampaignTable) -> str:
     return "\n".join(lines)
 
 
+def compared_lines(compared: Compared) -> list[str]:
+    """A campaign beside another one with the same seeds."""
+    one = compared
+    return [
+        f"| points of the {one.runs} runs that both have | mean error | in 95 % | NEES/dof |",
+        "|---|---|---|---|",
+        f"| here | {quantity_text(one.mean_m, 'm')} | {100 * one.coverage95:.1f} % | {one.nees_per_dof:.2f} |",
+        f"| {one.name} | {quantity_text(one.other_mean_m, 'm')} | {100 * one.other_coverage95:.1f} % "
+        f"| {one.other_nees_per_dof:.2f} |",
+        f"| ratio | x {one.ratio:.2f} | | |",
+    ]
+
+
 def _sections(text: str) -> dict[str, str]:
     sections: dict[str, str] = {}
     heading = ""
@@ -86,4 +101,4 @@ def _sections(text: str) -> dict[str, str]:
             sections[heading] = ""
         if heading:
             sections[heading] += line + "\n"
-    return sections
+    return {heading: text.rstrip() + "\n" for heading, text in sections.items()}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..estimator.baseline import ClickedPoint
+from ..estimator.pipes import INSET_SHARE
 from ..factors.camera import CameraModel
 from ..factors.measurements import CloudFrame, CylinderSighting, MarkerSighting, OutlineSighting, Pick, StereoFrame
 from ..factors.rig import Board, Cameras, Distance, Marker, Mount, Pipe, Pose, Rig
@@ -33,6 +34,8 @@ from .measurement_level_world import World
 Measurement = MarkerSighting | StereoFrame | CloudFrame | CylinderSighting | Pick | OutlineSighting
 START_NS = 1_000_000_000
 COLOUR_SIZE = (640, 480)
+OUTLIER_STREAM = 1
+"""Last word of the seed from which outliers are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,8 @@ class Run:
 
 def draw(scenario: Scenario, seed: int) -> Run:
     """One run. The same scenario and seed give the same run."""
-    world = _build_world(scenario, np.random.default_rng([scenario.seed, seed]))
+    seeds = [scenario.seed, seed]
+    world = _build_world(scenario, np.random.default_rng(seeds), np.random.default_rng([*seeds, OUTLIER_STREAM]))
     measurements: list[Measurement] = [
         *stereo_frames(world),
         *marker_sightings(world),
@@ -87,7 +91,7 @@ def base_rig(scenario: Scenario, side: float, radius_m: float) -> Rig:
     return Rig.model_validate(merged(rig.model_dump(mode="json", by_alias=True), scenario.rig))
 
 
-def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
+def _build_world(scenario: Scenario, rng: np.random.Generator, outlier_rng: np.random.Generator) -> World:
     nominal_radius_m = 0.5 * float(rng.choice([0.06, 0.089, 0.11]))
     rig = base_rig(scenario, float(rng.choice([-1.0, 1.0])), nominal_radius_m)
     # A wide draw would be a pipe of another kind than the file says.
@@ -116,8 +120,15 @@ def _build_world(scenario: Scenario, rng: np.random.Generator) -> World:
         stamps_ns=stamps_ns,
         place_stamps_ns=tuple(stamps_ns[i] for i in nearest),
         points_w=_named_points(scenario, scene, rng),
+        inset=_inset(scenario, rng),
         rng=rng,
+        outlier_rng=outlier_rng,
     )
+
+
+def _inset(scenario: Scenario, rng: np.random.Generator) -> float:
+    """What the pipe's edges share; from a stream of its own, so that nothing else is drawn anew."""
+    return float(rng.spawn(1)[0].normal(0.0, INSET_SHARE)) if scenario.faults else 0.0
 
 
 def _named_points(scenario: Scenario, scene: Scene, rng: np.random.Generator) -> dict[str, Float]:
@@ -160,7 +171,9 @@ def _truth(world: World) -> Truth:
         o_T_b=o_T_w @ world.scene.w_T_b,
         o_T_f={name: o_T_w @ w_T_f for name, w_T_f in world.w_T_f.items()},
         points_b_m={name: transform(b_T_w, point) for name, point in world.points_w.items()},
-        pipe=TruePipe(transform(b_T_w, pipe.base), b_T_w[:3, :3] @ pipe.axis, pipe.radius_m),
+        pipe=TruePipe(
+            transform(b_T_w, pipe.base), b_T_w[:3, :3] @ pipe.axis, pipe.radius_m, world.inset * pipe.radius_m
+        ),
         rig=world.true,
     )
 

@@ -46,8 +46,8 @@ def _cloud_frame(world: World, stamp_ns: int, count: int, rng: np.random.Generat
     measured = measured + rng.normal(0.0, 1.0, len(depth_m)) * sigma_z * world.scenario.noise_factors.clouds
     outliers = world.scenario.outliers
     if "clouds" in outliers.families:
-        hit = rng.random(len(measured)) < outliers.share
-        measured = measured + hit * rng.uniform(-outliers.size_m, outliers.size_m, len(measured))
+        hit = world.outlier_rng.random(len(measured)) < outliers.share
+        measured = measured + hit * world.outlier_rng.uniform(-outliers.size_m, outliers.size_m, len(measured))
     sigma_m = sigma_z * slope
     return CloudFrame(
         stamp_ns=stamp_ns,
@@ -148,7 +148,7 @@ def _pick(world: World, stamp_ns: int, point_id: str, role: str, exact_px: Float
     sigma_px = np.hypot(settings.sigma_px, world.rig.noise.pick_floor_px)
     px = exact_px + rng.normal(0.0, sigma_px * world.scenario.noise_factors.picks, 2)
     if "picks" in world.scenario.outliers.families:
-        px = spoil(px[None], world.scenario.outliers, rng)[0]
+        px = spoil(px[None], world.scenario.outliers, world.outlier_rng)[0]
     covariance = settings.sigma_px**2 * np.eye(2)
     return Pick(stamp_ns, "m_left", point_id, role, px, px, covariance)  # pyright: ignore[reportArgumentType]
 
@@ -157,7 +157,8 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
     """The two true edges, each shifted and turned by noise about its foot near the click."""
     camera, rng, pipe = world.true.cameras["m_left"], world.rng, world.scene.pipe
     m_T_w = invert(w_T_m)
-    lines = outline_lines(transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis, pipe.radius_m, camera.K)
+    visible_m = pipe.radius_m * (1.0 - world.inset)
+    lines = outline_lines(transform(m_T_w, pipe.base), m_T_w[:3, :3] @ pipe.axis, visible_m, camera.K)
     if lines is None:
         return None
     half_px = 0.25 * camera.height
@@ -168,8 +169,7 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
         feet[i] = pick_px - (line @ np.r_[pick_px, 1.0]) * line[:2]
         spread = np.array([np.hypot(sigmas[0], EDGE_FLOOR_PX), sigmas[1]])
         shift, turn = rng.normal(0.0, spread * world.scenario.noise_factors.outlines)
-        if "outlines" in world.scenario.outliers.families and rng.random() < world.scenario.outliers.share:
-            shift += rng.uniform(-1.0, 1.0) * world.scenario.outliers.size_px
+        shift += _edge_outlier_px(world)
         noisy[i] = _moved_line(line, feet[i], shift, turn)
         along = np.array([-noisy[i, 1], noisy[i, 0]])
         extents[i] = feet[i] + np.outer([-half_px, half_px], along)
@@ -184,6 +184,14 @@ def _outline(world: World, stamp_ns: int, w_T_m: Float, pick_px: Float) -> Outli
         pick_px=pick_px,
         quality=1.0,
     )
+
+
+def _edge_outlier_px(world: World) -> float:
+    """What a gross error adds to the place of an edge."""
+    outliers, rng = world.scenario.outliers, world.outlier_rng
+    if "outlines" not in outliers.families or rng.random() >= outliers.share:
+        return 0.0
+    return float(rng.uniform(-1.0, 1.0)) * outliers.size_px
 
 
 def _moved_line(line: Float, foot_px: Float, shift_px: float, turn_rad: float) -> Float:

@@ -55,8 +55,8 @@ def _stereo_frame(
     left_px = left_px + rng.normal(0.0, sigma_px, (n, 2))
     right_px = right_px + rng.normal(0.0, sigma_px, (n, 2))
     if "tracks" in world.scenario.outliers.families:
-        left_px = spoil(left_px, world.scenario.outliers, rng)
-        right_px = spoil(right_px, world.scenario.outliers, rng)
+        left_px = spoil(left_px, world.scenario.outliers, world.outlier_rng)
+        right_px = spoil(right_px, world.scenario.outliers, world.outlier_rng)
     covariance = np.tile(settings.sigma_px**2 * np.eye(2), (n, 1, 1))
     connected = int(lives.sum())
     first = stamp_ns == world.stamps_ns[0]
@@ -127,7 +127,7 @@ def _sighting(world: World, stamp_ns: int, name: str, board: str, marker: int, e
     settings, factors, rng = world.scenario.markers, world.scenario.noise_factors, world.rng
     corners_px = exact_px + rng.normal(0.0, settings.sigma_px * factors.markers, (4, 2))
     if "markers" in world.scenario.outliers.families:
-        corners_px = spoil(corners_px, world.scenario.outliers, rng)
+        corners_px = spoil(corners_px, world.scenario.outliers, world.outlier_rng)
     covariance = np.tile(settings.sigma_px**2 * np.eye(2), (4, 1, 1))
     return MarkerSighting(stamp_ns, name, board, marker, corners_px, covariance, corners_px)  # pyright: ignore[reportArgumentType]
 

@@ -69,6 +69,8 @@ class TruePipe:
     axis_b: Float
     """Unit, shape (3,)."""
     radius_m: float
+    inset_m: float = 0.0
+    """How far its edges are seen inside of its outline."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,11 @@ class World:
     stamps_ns: tuple[int, ...]
     place_stamps_ns: tuple[int, ...]
     points_w: dict[str, Float]
+    inset: float
+    """How far inside of its outline the pipe's edges are seen, in all views, as a part of its radius."""
     rng: np.random.Generator
+    outlier_rng: np.random.Generator
+    """Of its own, so that a run with outliers has the scene and noise of the one without."""
 
 
 def project(camera: TrueCamera, w_T_camera: Float, points_w: Float) -> tuple[Float, Float]:

@@ -4,9 +4,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from surecut.estimator.bounded import Bounded, Limits
+from surecut.estimator.bounded import Bounded
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
+from surecut.estimator.limits import Limits
 from surecut.estimator.marginal import FAMILY, gaussian_of, marginal
 from surecut.estimator.points_in_base import point_blocks
 from surecut.estimator.surfaces import lay_on_surfaces

@@ -19,7 +19,7 @@ from surecut.simulation.campaign_report import report_html
 from surecut.simulation.campaign_row import failed_row, quantities_of
 from surecut.simulation.campaign_run import run_measurements
 from surecut.simulation.campaign_table import coverage_at, tabulate, write_tables
-from surecut.simulation.campaign_validation import update_validation
+from surecut.simulation.campaign_validation import update_validation, validation_section
 from surecut.simulation.evaluate import point_quantity, scalar_quantity
 from surecut.simulation.measurement_level_scenario import Scenario, load_scenarios
 
@@ -158,7 +158,11 @@ def test_a_validated_range_spans_what_the_runs_covered_and_refuses_what_refutes_
     rows.append(rows_with(3.0, passed=False) | {"covered": [{"distance_m": 99.0}]})
     found = validated_range(rows, "measurements", "2030-01-01, commit a")
     assert (found.runs, found.coverage95, found.level) == (50, 1.0, "measurements")
-    assert found.ranges["distance_m"] == (1.0, 50.0)
+    # central 98 % of 1, 2, ... 50: quantiles by linear interpolation, 1 + 49 q
+    assert found.ranges["distance_m"] == (1.49, 49.51)
+    # one poor run among two hundred does not widen what counts as tested
+    poor = rows_with(3.0) | {"covered": [dict.fromkeys(QUANTITIES, 900.0)]}
+    assert validated_range([*rows[:50] * 4, poor], "measurements", "").ranges["radius95_m"] == (1.0, 50.0)
     file = tmp_path / "range.yaml"
     file.write_text(range_text(found))
     assert load_validated_range(file) == seal(found)
@@ -214,3 +218,46 @@ def test_a_section_of_the_validation_page_is_replaced_and_others_stay(tmp_path):
 def test_scalars_without_a_covariance_are_counted():
     bad = scalar_quantity("calibration", "baseline", 0.15, 0.0, 0.15, "m")
     assert math.isnan(bad.nees)
+
+
+def test_points_beside_those_of_another_campaign():
+    """Only runs that both have count, and of two campaigns the errors' means are compared."""
+    mine = [rows_with(4.0 * 9.0) | {"run": 0}, rows_with(4.0) | {"run": 1}, rows_with(900.0) | {"run": 7}]
+    others = [rows_with(4.0) | {"run": 0}, rows_with(1.0) | {"run": 1}, rows_with(1.0) | {"run": 2}]
+    table = tabulate(mine, ("clean", others))
+    found = table.compared
+    assert found is not None
+    # errors are 10 mm times the root of the squared deviation: 60 and 20 mm against 20 and 10 mm
+    assert (found.runs, found.mean_m, found.other_mean_m) == (2, pytest.approx(0.04), pytest.approx(0.015))
+    assert found.ratio == pytest.approx(0.04 / 0.015)
+    # 11.3 is the 99 % point of chi-square with three degrees of freedom, 7.8 the 95 % one
+    assert (found.coverage95, found.other_coverage95) == (0.5, 1.0)
+    assert (found.nees_per_dof, found.other_nees_per_dof) == (pytest.approx(40 / 6), pytest.approx(5 / 6))
+    assert "| ratio | x 2.67 |" in validation_section(table)
+    assert tabulate(mine, ("clean", [rows_with(1.0) | {"run": 5}])).compared is None
+
+
+def test_what_is_left_out_and_what_inputs_do_is_in_table_and_page():
+    without = {"reason": "", "errors_m": [0.03], "radius95_m": [0.08]}
+    failed = {"reason": "no board", "errors_m": [], "radius95_m": []}
+    rows = [
+        rows_with(4.0) | {
+            "run": run,
+            "radius95_m": [0.02],
+            "leave_out": {"marker corners": without if run else failed, "picks": without},
+            "sensitivity": [{"input": "baseline by 1 mm", "moved_m": 0.004 * (run + 1)}],
+        }
+        for run in range(2)
+    ]  # fmt: skip
+    table = tabulate(rows)
+    corners, picks = table.left_out
+    assert (corners.name, corners.runs, corners.failed) == ("marker corners", 2, 1)
+    assert (corners.mean_error_ratio, corners.mean_radius_ratio) == (pytest.approx(1.5), pytest.approx(4.0))
+    assert (picks.failed, picks.mean_error_ratio) == (0, pytest.approx(1.5))
+    assert table.sensitivity_m == {"baseline by 1 mm": (pytest.approx(0.006), pytest.approx(0.008))}
+    text = validation_section(table)
+    assert "marker corners x 1.50 (radius x 4.00, 1 of 2 without a result)" in text
+    assert "baseline by 1 mm: 6.0 mm" in text
+    page = report_html("s", table, rows)
+    assert "Without one family" in page
+    assert "baseline by 1 mm" in page

@@ -9,6 +9,7 @@ from scipy.stats import chi2
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
 from surecut.estimator.landmark_map import landmark_map
+from surecut.estimator.mount_check import held_part
 from surecut.estimator.run import finish
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors.camera import CameraModel
@@ -84,6 +85,78 @@ def test_a_bare_wall_leaves_its_own_directions_loose():
     sigma = np.sqrt(np.diag(found.covariance))
     assert sigma[3] > 1.0 and sigma[4] > 1.0 and sigma[2] > 1.0  # noqa: PT018
     assert sigma[5] < 0.05 and sigma[0] < 0.02 and sigma[1] < 0.02  # noqa: PT018
+
+
+def test_the_sigma_of_a_wall_is_the_one_known_by_hand():
+    """N distances of sigma s: s / sqrt(N) along the normal, s / sqrt(sum of squared arms) about each axis in it."""
+    rng = np.random.default_rng(7)
+    sigma, count = 0.006, 400
+    landmarks = np.column_stack((rng.uniform(-1, 1, (count, 2)), np.full(count, 2.0)))
+    grid = np.stack(np.meshgrid(np.linspace(-1.1, 1.1, 90), np.linspace(-1.1, 1.1, 90)), axis=2).reshape(-1, 2)
+    wall = np.column_stack((grid, np.full(len(grid), 2.0)))
+    tiny = np.full(len(wall), 1e-4)
+    cloud = CloudFrame(0, wall, np.tile([0.0, 0.0, -1.0], (len(wall), 1)), tiny, tiny, np.zeros(len(wall)))
+    seen = landmarks + np.outer(rng.normal(0, sigma, count), [0, 0, 1])
+    points = MapPoints(seen, np.full(count, sigma), np.zeros((count, 3)))
+    found = register_points(points, cloud, np.eye(4), np.array([1e-6, 1e-6]))
+    assert found is not None
+    stated = np.sqrt(np.diag(found.covariance))
+    about_x, about_y = (sigma / np.sqrt(((landmarks[:, i] - landmarks[:, i].mean()) ** 2).sum()) for i in (1, 0))
+    # A turn about the camera moves the wall's middle too: the offset's own sigma is that with the turns known.
+    known_turns = 1.0 / np.sqrt(np.linalg.inv(found.covariance)[5, 5])
+    robust = 1.0 / 0.7  # what the kernel costs normal errors
+    assert sigma / np.sqrt(count) < known_turns * 1.05 < 1.05 * robust * sigma / np.sqrt(count)
+    for value, true in ((stated[0], about_x), (stated[1], about_y)):
+        assert 0.95 * true < value < 1.05 * robust * true
+    assert min(stated[2:5]) > 1.0  # turn about the normal, and both ways along the wall
+
+
+def test_a_floor_leaves_both_ways_along_it_and_the_turn_about_its_normal_loose():
+    points, cloud, true = scene(("floor",), 3)
+    found = register_points(points, cloud, true, DEPTH_SIGMAS)
+    assert found is not None
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert min(sigma[3], sigma[5], sigma[1]) > 1.0
+    assert max(sigma[4] / 0.05, sigma[0] / 0.03, sigma[2] / 0.03) < 1.0
+
+
+def test_a_cylinder_leaves_its_own_axis_loose():
+    """An upright pipe: free are the way along it and the turn about it."""
+    rng = np.random.default_rng(9)
+    radius, middle = 0.15, np.array([0.0, 0.0, 1.2])
+
+    def mantle(count):
+        angle, height = rng.uniform(-1.2, 1.2, count), rng.uniform(-0.5, 0.5, count)
+        out = np.column_stack((np.sin(angle), np.zeros(count), -np.cos(angle)))
+        return middle + radius * out + np.outer(height, [0, 1, 0]), out
+
+    surface, normals = mantle(4000)
+    small = np.full(len(surface), 0.002)
+    cloud = CloudFrame(0, surface, normals, small, small, np.zeros(len(surface)))
+    landmarks, _ = mantle(150)
+    seen = landmarks + rng.normal(0, 0.003, landmarks.shape)
+    found = register_points(MapPoints(seen, np.full(150, 0.003), np.zeros((150, 3))), cloud, np.eye(4), DEPTH_SIGMAS)
+    assert found is not None
+    # The tangent that turns about the pipe's own axis, which stands 1.2 m before the camera.
+    about = np.concatenate(([0.0, 1.0, 0.0], -np.cross([0.0, 1.0, 0.0], middle)))
+    along = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    information = np.linalg.inv(found.covariance)
+    held = [np.array([0, 0, 0, 1.0, 0, 0]), np.array([0, 0, 0, 0, 0, 1.0]), np.eye(6)[0], np.eye(6)[2]]
+    for free in (about, along):
+        assert free @ information @ free < 0.01 * min(h @ information @ h for h in held)
+    assert np.sqrt(found.covariance[4, 4]) > 0.05
+    assert np.sqrt(found.covariance[3, 3]) < 1.2  # with the turn about the pipe, not without
+
+
+def test_a_disagreement_counts_along_the_held_directions_only():
+    spread = np.diag([1e-6, 1e-6, 1.0, 1.0, 1.0, 1e-4])
+    own = np.diag([1e-6] * 3 + [1e-6] * 3)
+    held = held_part(np.array([0.002, 0.0, 0.5, 0.3, -0.4, 0.0]), spread, own)
+    assert held is not None
+    assert held.directions == 3
+    assert held.total == pytest.approx(0.002**2 / 2e-6)
+    np.testing.assert_allclose(held.residual, [0.002, 0, 0, 0, 0, 0], atol=1e-12)
+    assert held_part(np.ones(6), np.eye(6), own) is None
 
 
 def test_landmarks_before_the_surfaces_contradict():

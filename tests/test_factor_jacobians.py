@@ -136,6 +136,7 @@ def test_outline_factor(camera):
     if camera == "m_right":
         values.insert(keys.extrinsics(camera), gtsam.Pose3.Expmap(np.array([0.01, 0, 0.02, 0.15, 0, 0])))
     line = np.array([0.995, 0.0998, -170.0])
+    values.insert(keys.inset(0), np.array([0.002]))
     factor = pipe.outline_factor(camera, line, sigmas([0.01, 0.02]), keys.keyframe(0), 0)
     check(factor, values, whitener(factor.noiseModel()))
 

@@ -64,3 +64,25 @@ def test_another_undetermined_variable_is_an_error():
     point = keys.point(0)
     with pytest.raises(ObservabilityError, match="pick the point again"):
         Incremental().update(start(point, distance(point)))
+
+
+def test_after_settling_the_right_factor_is_switched_off():
+    """Factors that are off have no place in the new graph: those behind them move up."""
+    solver = Incremental()
+    update = start(LOST, point_prior(LOST, [0.1, 0.0, 2.0]))
+    for x in (0.3, 0.6):
+        update.add(point_prior(GOOD, [x, 0.0, 2.0]), record(f"at {x}"))
+    solver.update(update)
+    solver.switch_off([1])
+    assert solver.settle(3).atPoint3(GOOD)[0] == pytest.approx(0.45, abs=1e-6)
+    assert solver.switch_off([3]).atPoint3(GOOD)[0] == pytest.approx(0.6, abs=1e-6)
+    assert solver.values().atPoint3(LOST)[0] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_landmark_that_nothing_determines_is_passed_over_in_covariances():
+    solver = Incremental()
+    solver.update(start(LOST, point_prior(LOST, [0.1, 0.0, 2.0])))
+    solver.log.replace(2, distance(LOST))
+    np.testing.assert_allclose(solver.joint_covariance([GOOD]), 1e-4 * np.eye(3), rtol=1e-6)
+    with pytest.raises(ObservabilityError, match="landmark 2"):
+        solver.joint_covariance([GOOD, LOST])

@@ -147,7 +147,7 @@ def test_picks_and_outlines(runs):
             a = transform(c_T_b, truth.pipe.point_b_m + 0.8 * truth.pipe.axis_b)
             b = transform(c_T_b, truth.pipe.point_b_m + 1.3 * truth.pipe.axis_b)
             for line, foot, covariance in zip(outline.lines, outline.foot_px, outline.covariance, strict=True):
-                residual, _ = outline_residual(line, camera.K, a, b, truth.pipe.radius_m)
+                residual, _ = outline_residual(line, camera.K, a, b, truth.pipe.radius_m - truth.pipe.inset_m)
                 model = covariance + np.diag([EDGE_FLOOR_PX**2, 0.0])
                 noise = outline_noise(line, foot, model, camera.K, a, b)
                 edges.append(whitened(residual[None], noise[None]))

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from mcap.records import Attachment, Channel, Message, Schema
@@ -11,7 +12,13 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from surecut.estimator.cli import main
+from surecut.estimator.items import wanted_topics
+from surecut.estimator.optimise import rig_of
 from surecut.estimator.result_json import from_json
+from surecut.estimator.sensing import Sensing
+from surecut.estimator.stream.graph_loop import GraphLoop
+from surecut.estimator.stream.memory import load
+from surecut.estimator.stream.settings import StreamSettings
 from surecut.io.messages import PointsBody
 from surecut.io.reader import LogReader
 
@@ -66,6 +73,32 @@ def test_all_four_families_are_in_the_graph(result):
 def test_running_and_batch_solution_agree(result):
     assert max(result.streaming_difference_sigma.values()) < 0.3
     assert result.streaming_difference_sigma["points"] < 0.1
+
+
+def test_a_stream_may_begin_with_the_result(done, result):
+    """Points and boards are where they were, and the camera finds itself by the board, in the same {o}."""
+    memory = load(done / "e.json")
+    assert load(done / "e.mcap").prior.keys == memory.prior.keys
+    with LogReader(SAMPLE) as reader:
+        rig = rig_of(reader, None)
+    answers = []
+    loop = GraphLoop(rig, StreamSettings(), answers.append, memory)
+    loop.answer(memory.stamp_ns)
+    assert answers[0].keyframe_ns is None
+    for p in result.points:
+        begun = next(q for q in answers[0].points if q.id == p.id)
+        np.testing.assert_allclose(begun.position_m, p.position_m, atol=0.05 * p.radius95_m)
+        assert 0.5 < begun.radius95_m / p.radius95_m < 1.05
+    for sensed in Sensing(rig).run(LogReader(SAMPLE, wanted_topics(rig))):
+        loop.take(sensed)
+        if answers[-1].keyframe_ns is not None:
+            break
+    assert not loop.engine.astray
+    start = next(pose for pose in result.trajectory if pose.stamp_ns == answers[-1].keyframe_ns)
+    found = answers[-1].places["m"]
+    off = gtsam.Pose3.Logmap(gtsam.Pose3(found.matrix).between(gtsam.Pose3(start.matrix)))
+    assert (np.abs(off) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
+    assert np.abs(off).max() < 0.02
 
 
 def test_radius_holds_95_percent(result):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from surecut.factors.measurements import OutlineSighting, Rejection
 from surecut.factors.outline import outline_lines, outline_noise, outline_residual, plane_normal
-from surecut.frontends.pipe.limb import EdgeSeed, fit_edges
+from surecut.frontends.pipe.limb import EdgeSeed, confirmed_edges, fit_edges
 from surecut.frontends.pipe.predict import predict_outline
 from surecut.frontends.pipe.silhouette import OutlineFinder, silhouette_sighting
 from surecut.frontends.rays import pixel_rays
@@ -81,7 +81,10 @@ def test_edge_fit_is_unbiased_with_an_honest_sigma(light):
             foot = foot - (line[:2] @ foot + line[2]) * line[:2]
             seed_line = line + np.array([0, 0, rng.normal(0, 0.4)])
             seed = EdgeSeed(seed_line, foot, (-50, 50), 13.5 / z)
-            (fit,) = fit_edges(image.ravel().astype(float), ideal.reshape(-1, 2), [seed], 1.5)
+            pixels = image.ravel().astype(float), ideal.reshape(-1, 2)
+            (found,) = fit_edges(*pixels, [seed], 1.5)
+            assert found is not None
+            (fit,) = confirmed_edges(*pixels, [seed], [found], 1.5)
             assert fit is not None
             turn = np.arctan2(line[0] * fit.line[1] - line[1] * fit.line[0], line[:2] @ fit.line[:2])
             error = np.array([line[:2] @ fit.foot_px + line[2], turn])

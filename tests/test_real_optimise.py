@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from realdata import real_data
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from typer.testing import CliRunner
 
 from surecut.estimator.cli import application
 from surecut.estimator.commands.depthpath import command as depthpath
+from surecut.estimator.optimise import optimise as from_depth_alone
+from surecut.estimator.result_log import write_result
 from surecut.factors.rig import dump_rig, load_rig
 from surecut.frontends.cloud.frontend import CloudFrontEnd, average_depth
 from surecut.io.messages import CameraInfoBody, DepthBody, PoseBody
@@ -176,19 +179,41 @@ def test_kitchen_becomes_a_cloud():
     assert np.median(frame.sigma_m) < 0.03
 
 
-def test_kitchen_path_by_depth_alone(tmp_path):
-    log, out = real_data("kinect/kitchen.mcap"), tmp_path / "kitchen.tum"
-    rig = Path(__file__).parents[1] / "docs/examples/kitchen.rig.yaml"
-    depthpath(log, out, rig)
-    rows = np.loadtxt(out)
-    assert rows.shape == (120, 8)
+def kitchen_errors(path):
+    """Stamps, and the distances of a path from the reference: from the first pose on, and aligned; rms, m."""
+    log = real_data("kinect/kitchen.mcap")
     true = {m.stamp_ns: np.asarray(m.body.matrix) for m in LogReader(log, ["/truth/pose/b"])}
     stamps = sorted(true)
-    np.testing.assert_allclose(rows[:, 0], np.array(stamps) * 1e-9, atol=1e-6)
     first = np.linalg.inv(true[stamps[0]])
     reference = np.array([(first @ true[s])[:3, 3] for s in stamps])
-    rms = np.sqrt(((rows[:, 1:4] - reference) ** 2).sum(axis=1).mean())
-    rotation, _ = Rotation.align_vectors(reference - reference.mean(0), rows[:, 1:4] - rows[:, 1:4].mean(0))
-    left = reference - reference.mean(0) - rotation.apply(rows[:, 1:4] - rows[:, 1:4].mean(0))
+    assert path.shape == reference.shape
+    rms = np.sqrt(((path - reference) ** 2).sum(axis=1).mean())
+    rotation, _ = Rotation.align_vectors(reference - reference.mean(0), path - path.mean(0))
+    left = reference - reference.mean(0) - rotation.apply(path - path.mean(0))
+    return stamps, first @ true[stamps[-1]], rms, np.sqrt((left**2).sum(axis=1).mean())
+
+
+def test_kitchen_path_by_depth_alone(tmp_path):
+    log, out = real_data("kinect/kitchen.mcap"), tmp_path / "kitchen.tum"
+    depthpath(log, out, EXAMPLES / "kitchen.rig.yaml")
+    rows = np.loadtxt(out)
+    stamps, _, rms, aligned = kitchen_errors(rows[:, 1:4])
+    np.testing.assert_allclose(rows[:, 0], np.array(stamps) * 1e-9, atol=1e-6)
     assert rms < 0.0315  # KISS-ICP on the same frames: 63 mm, 39 mm aligned
-    assert np.sqrt((left**2).sum(axis=1).mean()) < 0.0195
+    assert aligned < 0.0195
+
+
+def test_kitchen_is_estimated_from_depth_alone(tmp_path):
+    found = from_depth_alone(real_data("kinect/kitchen.mcap"), EXAMPLES / "kitchen.rig.yaml")
+    stamps, end, rms, aligned = kitchen_errors(np.array([pose.matrix[:3, 3] for pose in found.trajectory]))
+    assert [pose.stamp_ns for pose in found.trajectory] == stamps
+    assert {pose.name for pose in found.trajectory} == {"b"}
+    assert rms < 0.0315
+    assert aligned < 0.0195
+    assert [event.kind for event in found.events] == ["depth_alone"]
+    last = found.poses[0]
+    turn = Rotation.from_matrix(end[:3, :3] @ last.matrix[:3, :3].T).as_rotvec()
+    error = np.concatenate([end[:3, 3] - last.matrix[:3, 3], turn])
+    assert error @ np.linalg.solve(last.covariance, error) < chi2.ppf(0.999, 6)
+    write_result(tmp_path / "kitchen.estimate.mcap", found)
+    assert len(list(LogReader(tmp_path / "kitchen.estimate.mcap", ["/estimate/pose/b"]))) == 120

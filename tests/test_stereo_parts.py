@@ -8,12 +8,12 @@ from stereo_scene import BASELINE, FOCAL, HEIGHT, WIDTH, K, camera, left_T_right
 from surecut.frontends.stereo.alignment import PatchGrid, align, make_patches
 from surecut.frontends.stereo.detection import detect
 from surecut.frontends.stereo.geometry import StereoGeometry, exponential, inverse, logarithm, project, transform
-from surecut.frontends.stereo.images import smooth, to_grey
+from surecut.frontends.stereo.images import dense, to_grey
 from surecut.frontends.stereo.keyframes import keyframe_reason
 from surecut.frontends.stereo.matching import search_right
 from surecut.frontends.stereo.motion import estimate_motion, point_covariance
 from surecut.frontends.stereo.settings import StereoSettings
-from surecut.frontends.stereo.warp import warp_offsets
+from surecut.frontends.stereo.warp import bend_offsets, curvatures
 
 
 def rig(left_T=None):
@@ -105,7 +105,7 @@ def test_alignment_finds_a_shift_to_hundredths_whatever_the_brightness(gain):
     # Shifted in the frequency domain: OpenCV's own warps are off by hundredths themselves.
     phase = np.fft.fftfreq(WIDTH)[None] * shift[0] + np.fft.fftfreq(HEIGHT)[:, None] * shift[1]
     moved = np.fft.ifft2(np.fft.fft2(image) * np.exp(-2j * np.pi * phase)).real * gain + 10
-    first, second = smooth(np.rint(image).astype(np.uint8), 0.7), smooth(np.rint(moved).astype(np.uint8), 0.7)
+    first, second = (dense(np.rint(picture).astype(np.uint8), 0.7) for picture in (image, moved))
     grid = PatchGrid(7, bend_sigma=0.06)
     px = detect(np.rint(image).astype(np.uint8), np.zeros((0, 2)), 100, 10.0, 15, 1.0)
     found = align(second, make_patches(first, px, grid, 1.0), px.copy(), np.tile(np.eye(2), (len(px), 1, 1)), grid)
@@ -164,12 +164,51 @@ def test_projection_behind_the_camera_is_nan():
 
 
 def test_a_turned_patch_fits_beside_its_centre():
-    """Turned by theta about the vertical, u / f = tan(phi + theta): half its curvature times the weights' moment."""
-    theta, moment = 0.3, 15.0
+    """A camera that turns by theta about the vertical sees d at W (d + (c . d) d); the fit is off as foretold."""
+    theta = 0.3
     turn = np.eye(4)
     turn[:3, :3] = [[np.cos(theta), 0, np.sin(theta)], [0, 1, 0], [-np.sin(theta), 0, np.cos(theta)]]
-    left, _ = warp_offsets(np.array([[0.0, 0.0, 2.0]]), turn[None], rig(), moment)
-    expected = moment * np.sin(theta) / np.cos(theta) ** 3 / K[0, 0]
-    assert left[0] == pytest.approx([expected, 0.0], rel=0.01, abs=1e-6)
-    unknown = warp_offsets(np.full((1, 3), np.nan), turn[None], rig(), moment)
-    assert not np.any(unknown)
+    left, _ = curvatures(np.array([[0.0, 0.0, 2.0]]), np.zeros((1, 2)), turn[None], rig())
+    # u / f = tan(phi + theta): half its second derivative over its first.
+    assert left[0] == pytest.approx([np.tan(theta) / K[0, 0], 0.0], rel=1e-6, abs=1e-9)
+    assert not np.any(curvatures(np.full((1, 3), np.nan), np.zeros((1, 2)), turn[None], rig()))
+
+    rng = np.random.default_rng(8)
+    waves = list(zip(rng.normal(0, 0.45, (40, 2)), rng.normal(0, 13, 40), rng.uniform(0, 2 * np.pi, 40), strict=True))
+
+    def seen(u, v):
+        return (128 + sum(a * np.cos(k[0] * u + k[1] * v + phase) for k, a, phase in waves)).astype(np.float32)
+
+    u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+    image, grid, c = seen(u, v), PatchGrid(7, bend_sigma=0.06), np.array([3e-3, 0.0])
+    px = detect(np.clip(image, 0, 255).astype(np.uint8), np.zeros((0, 2)), 40, 25.0, 20, 1.0)
+    patches = make_patches(dense(image, 0.7), px, grid, 1.0)
+    foretold = bend_offsets(np.tile(np.eye(2), (len(px), 1, 1)), patches.bend, np.tile(c, (len(px), 1)))
+    off = []
+    for row, (x, y) in enumerate(px):
+        back = 1.0 - c[0] * np.clip(u - x, -25, 25)
+        bent = seen(x + back * (u - x), y + back * (v - y))
+        off.append(
+            align(dense(bent, 0.7), patches.take(np.array([row])), px[[row]], np.eye(2)[None], grid).px[0] - (x, y)
+        )
+    assert np.sqrt((foretold**2).mean()) > 0.02
+    assert np.abs(off - foretold).max() < 0.1 * np.abs(foretold).max()
+
+
+def test_alignment_does_not_prefer_whole_pixels():
+    """Shifts by all phases of a pixel: what is off does not follow the phase."""
+    image = cv2.GaussianBlur(texture(np.random.default_rng(9), HEIGHT, WIDTH), (0, 0), 0.8)
+    grid = PatchGrid(7, bend_sigma=0.06)
+    first = np.rint(image).astype(np.uint8)
+    px = detect(first, np.zeros((0, 2)), 120, 10.0, 15, 1.0)
+    patches = make_patches(dense(first, 0.7), px, grid, 1.0)
+    off = []
+    for shift in (phases := np.arange(8) / 8):
+        factor = np.exp(-2j * np.pi * np.fft.fftfreq(WIDTH)[None] * shift)
+        moved = np.fft.ifft2(np.fft.fft2(image) * factor).real
+        found = align(
+            dense(np.rint(moved).astype(np.uint8), 0.7), patches, px, np.tile(np.eye(2), (len(px), 1, 1)), grid
+        )
+        off.append(np.median((found.px - px)[found.converged, 0]) - shift)
+    amplitude = 2 * np.abs(np.mean(np.array(off) * np.exp(2j * np.pi * phases)))
+    assert amplitude < 0.002

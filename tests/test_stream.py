@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
 from surecut.estimator.pipeline import Pipeline
 from surecut.estimator.points_in_base import point_blocks
-from surecut.estimator.sensing import Sensing, wanted_topics
+from surecut.estimator.sensing import Sensing
 from surecut.estimator.stream.memory import MemoryFileError, from_json, load
 from surecut.factors import keys
 from surecut.io.reader import LogReader
@@ -98,8 +99,8 @@ def free_port():
         return s.getsockname()[1]
 
 
-def first_line_with_points(port, seconds):
-    """The first JSON line that says where the points are."""
+def first_line(port, seconds, wanted=lambda update: update["points"]):
+    """The first JSON line that has what is wanted; by itself, one that says where the points are."""
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         try:
@@ -108,11 +109,11 @@ def first_line_with_points(port, seconds):
                 with connection.makefile("rb") as lines:
                     for line in lines:
                         update = json.loads(line)
-                        if update["points"]:
+                        if wanted(update):
                             return update
         except OSError:
             time.sleep(0.05)
-    raise AssertionError(f"no points within {seconds} s")
+    raise AssertionError(f"no such line within {seconds} s")
 
 
 def test_answer_is_back_after_kill(streamed, offline, tmp_path):
@@ -121,11 +122,15 @@ def test_answer_is_back_after_kill(streamed, offline, tmp_path):
     port = free_port()
     process = surecut("--replay", SAMPLE, "--rate", 1, "--tcp", port, "--checkpoint", memory)
     try:
-        update = first_line_with_points(port, 60)
+        update = first_line(port, 60)
         for point in update["points"]:
             position, sigma = offline[point["id"]]
             assert (np.abs(np.array(point["position_m"]) - position) < 0.5 * sigma).all()
             assert point["verdict"] != "GO"
+        found = first_line(port, 60, lambda update: "m" in update["poses"])
+        assert "relocalising" not in {fault["name"] for fault in found["health"]["faults"]}
+        begun, now = (np.array(line["poses"]["b"]["matrix"]) for line in (update, found))
+        np.testing.assert_allclose(now, begun, atol=0.02)  # the same {o}
         process.send_signal(signal.SIGKILL)
         process.wait(10)
         assert load(memory).keyframes > 0  # whole, whatever it was doing

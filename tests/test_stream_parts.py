@@ -5,31 +5,21 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from stream_messages import LEFT, MS, RIG, RIGHT, START, image
 
+from surecut.estimator.bundle import Bundle
 from surecut.estimator.decision import Decision
+from surecut.estimator.sensing import Sensed
 from surecut.estimator.stream.follower import Follower
-from surecut.estimator.stream.health import Monitor
 from surecut.estimator.stream.ordering import LiveOrder
 from surecut.estimator.stream.settings import StreamSettings
+from surecut.estimator.stream.thinning import Thinning
 from surecut.estimator.stream.trust import EXPIRED, grown, verdict_of
-from surecut.estimator.stream.wire import Answer, Frame, Place
-from surecut.factors.measurements import Event
-from surecut.factors.rig import Cut, Rig
-from surecut.io.live.interfaces import HealthState
-from surecut.io.messages import ImageBody, Message, PickBody
+from surecut.estimator.stream.wire import Frame, Place
+from surecut.factors.measurements import StereoFrame
+from surecut.factors.rig import Cut
+from surecut.io.messages import Message, PickBody
 from surecut.io.pairing import StereoPair
-from surecut.io.pixels import RawPixels
-
-RIG = Rig()
-LEFT, RIGHT = RIG.cameras.m_left.image_topic, RIG.cameras.m_right.image_topic
-MS = 1_000_000
-START = 1_700_000_000_000_000_000
-
-
-def image(topic, stamp_ms, value=0, arrived_ms=None):
-    pixels = RawPixels("mono8", 4, 2, 4, False, np.full(8, value % 251, np.uint8))
-    arrived = stamp_ms if arrived_ms is None else arrived_ms
-    return Message(topic, START + round(arrived * MS), START + round(stamp_ms * MS), "m", ImageBody(pixels, topic))
 
 
 def click(stamp_ms, name="P1", camera="m_left"):
@@ -127,6 +117,16 @@ def test_click_joins_its_frame_or_comes_as_a_late_one():
     assert (at, True, ["P1"]) in feed.clicks
 
 
+def test_click_in_an_old_picture_is_believed():
+    feed = Feed()
+    now = feed.steady(300)
+    feed.add(click(1000), now)  # fourteen seconds ago
+    feed.tick(now + 30)
+    assert feed.clicks == [(1000, False, ["P1"])]
+    assert feed.order.counts["stamp_outlier"] == 0
+    assert feed.order.strays() == {}
+
+
 def test_stamp_from_the_future_stops_nothing_and_a_set_clock_is_followed():
     feed = Feed()
     at = feed.steady(6)
@@ -140,73 +140,6 @@ def test_stamp_from_the_future_stops_nothing_and_a_set_clock_is_followed():
     feed.tick(at + 1000)
     assert feed.order.counts["clock_jumps"] == 1
     assert feed.pairs[-1] == at + 550 - 3_600_000
-
-
-# Health ---------------------------------------------------------------------------------------------------------------
-
-
-def names(health):
-    return {fault.name for fault in health.faults}
-
-
-def fed(monitor, start_ms, stop_ms, value=lambda ms: ms, shift_ms=0):
-    for ms in range(start_ms, stop_ms, 50):
-        for topic in (LEFT, RIGHT):
-            monitor.heard(image(topic, ms + shift_ms, value(ms), ms), START + ms * MS)
-
-
-@pytest.fixture
-def monitor():
-    monitor = Monitor(RIG, StreamSettings())
-    fed(monitor, 0, 2000)
-    monitor.answered(Answer(START, START, {}))
-    return monitor
-
-
-def state(monitor, ms):
-    return monitor.health(START + ms * MS, START + ms * MS)
-
-
-def test_healthy(monitor):
-    assert state(monitor, 2000).state is HealthState.OK
-
-
-def test_frozen_camera_is_named_within_two_seconds(monitor):
-    fed(monitor, 2000, 4000, value=lambda ms: 7)
-    assert f"camera_frozen {LEFT}" in names(state(monitor, 4000))
-    fed(monitor, 4000, 4500)
-    assert not names(state(monitor, 4500))
-
-
-def test_silent_topic_is_named_within_two_seconds(monitor):
-    assert f"topic_missing {RIGHT}" in names(state(monitor, 3950))
-    assert state(monitor, 3950).state is HealthState.FAILED
-
-
-@pytest.mark.parametrize("seconds", [1.0, -30.0])
-def test_clock_jump_is_named_within_two_seconds(monitor, seconds):
-    fed(monitor, 2000, 4000, shift_ms=round(1e3 * seconds))
-    assert f"clock_jump {LEFT}" in names(state(monitor, 4000))
-
-
-def test_jitter_is_no_clock_jump(monitor):
-    for i in range(60):
-        ms = 2000 + 50 * i
-        late = 800 if i % 5 else 0  # most messages come late, some do not
-        monitor.heard(image(LEFT, ms, i, ms + late), START + (ms + late) * MS)
-    assert not any(name.startswith("clock_jump") for name in names(state(monitor, 5000)))
-
-
-def test_pairs_apart_and_knocks_are_named(monitor):
-    order = LiveOrder(RIG, 100 * MS)
-    for i in range(60):
-        order.add(image(LEFT, 50 * i), START + 50 * i * MS)
-        order.add(image(RIGHT, 50 * i + 20), START + (50 * i + 20) * MS)
-    monitor.paired(order.unpaired)
-    knock = Event(START + 1000 * MS, "board_knocked", "board f0 was knocked", "warning")
-    monitor.answered(Answer(START, START, {}, events=(knock,)))
-    fed(monitor, 2000, 2200)
-    assert {"pair_apart", "board_knocked"} <= names(state(monitor, 2200))
 
 
 # Poses and trust ------------------------------------------------------------------------------------------------------
@@ -262,3 +195,46 @@ def test_verdict_expires():
     assert verdict_of(decision, START + 31_000 * MS)[0] == EXPIRED
     assert verdict_of(replace(decision, expires_ns=None), START)[0] == EXPIRED
     assert verdict_of(None, START)[0] == "MEASURE MORE"
+
+
+class Behind(list):
+    """A queue of a graph that is so far behind."""
+
+    put = list.append
+    backlog = 0
+
+    def qsize(self):
+        return self.backlog
+
+
+def moved(number, keyframe=False, lost=False):
+    stamp, none, covariance = START + number * 50 * MS, np.empty((0, 2)), np.empty((0, 2, 2))
+    seen = np.empty(0, int), none, covariance, none, covariance
+    return Sensed(Bundle(stamp, StereoFrame(stamp, keyframe, *seen, step(0.01), 50, lost)))
+
+
+def test_graph_that_does_not_keep_up_gets_fewer_frames_and_the_whole_motion():
+    graph = Behind()
+    thinning = Thinning(graph, StreamSettings(), patient=False)
+    for i in range(40):
+        graph.backlog = 100 if i >= 10 else 0
+        thinning.put(moved(i, keyframe=i % 2 == 0, lost=i == 21))
+    frames = [sensed.bundle.frame for sensed in graph]
+    assert [f.stamp_ns for f in frames[:10]] == [START + i * 50 * MS for i in range(10)]
+    assert all(f.is_keyframe for f in frames[10:])
+    assert 2 <= len(frames) - 10 <= 3  # half a second apart
+    np.testing.assert_allclose(
+        sum(f.last_T_this[0, 3] for f in frames), 0.01 * (1 + (frames[-1].stamp_ns - START) / 50 / MS)
+    )
+    assert [f.lost for f in frames].count(True) == 1
+    assert thinning.taken() == 40 - len(frames)
+    assert thinning.taken() == 0
+
+
+def test_patient_sources_are_never_thinned():
+    graph = Behind()
+    graph.backlog = 199
+    thinning = Thinning(graph, StreamSettings(), patient=True)
+    for i in range(20):
+        thinning.put(moved(i))
+    assert len(graph) == 20

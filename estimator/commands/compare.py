@@ -15,11 +15,11 @@ from ...io.messages import PointsBody
 from ...io.reader import LogReader
 from ..baseline import ChainPoint
 from ..compare import chain_of_messages
+from ..items import wanted_topics
 from ..optimise import rig_of
 from ..output_files import write_text
 from ..result import Result
 from ..result_json import from_json
-from ..sensing import wanted_topics
 
 Float = NDArray[np.float64]
 TRUTH = "/truth/points"

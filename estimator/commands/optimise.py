@@ -18,9 +18,6 @@ from ..executor import Outcome, choose_executor
 from ..optimise import optimise
 from ..output_files import write_text
 from ..result import Result
-from ..result_json import from_json, to_json
-from ..result_log import tum_text, write_result
-from ..tables import result_tables
 
 HELP_EPILOG = """Examples:
 
@@ -88,7 +85,7 @@ def command(
     if not several:
         for job in work:
             result = _with_progress(job)
-            result_tables(result, Console())
+            _print(result)
         return
     _many(work, jobs, dask)
 
@@ -118,6 +115,8 @@ def _done(job: Job) -> bool:
     """A result counts as done when it is there, whole, and of this very log."""
     if job.output is None or not job.output.exists():
         return False
+    from ..result_json import from_json
+
     try:
         text = LogReader(job.output).attachment("result.json")
         if text is None:
@@ -137,7 +136,16 @@ def run_job(job: Job) -> str:
     return f"{len(result.points)} points, largest 95 % radius {1e3 * radius:.1f} mm, {state}"
 
 
+def _print(result: Result) -> None:
+    from ..tables import result_tables
+
+    result_tables(result, Console())
+
+
 def _write(job: Job, result: Result) -> None:
+    from ..result_json import to_json  # with libraries that need not be there before the front ends start
+    from ..result_log import tum_text, write_result
+
     for path in (job.output, job.json, job.tum):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

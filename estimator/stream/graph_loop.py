@@ -1,6 +1,5 @@
 """The graph's half of the stream: what the front ends saw in, answers out, within bounds of memory and time."""
 
-import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
-from ...factors.rig import Rig, dump_rig
+from ...factors.rig import Rig, sha256_of
 from ..bounded import Bounded
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
@@ -58,7 +57,7 @@ class GraphLoop:
         self._tell = tell
         self._checkpoint = checkpoint
         self._validated = validated
-        self._rig_sha256 = hashlib.sha256(dump_rig(rig).encode()).hexdigest()
+        self._rig_sha256 = sha256_of(rig)
         self.pipeline = Pipeline(rig)
         self.engine = self.pipeline.engine
         self._bounded = Bounded(self.engine, settings.limits)
@@ -83,7 +82,7 @@ class GraphLoop:
         """
         if self._first_ns is None:
             self._first_ns = sensed.stamp_ns
-        before = self.engine.odometry.last_keyframe
+        before, told = self.engine.odometry.last_keyframe, self._told()
         try:
             self.pipeline.take(sensed)
         except ObservabilityError as error:
@@ -92,12 +91,17 @@ class GraphLoop:
             raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
         new = self.engine.odometry.last_keyframe > before
         clicked = bool(sensed.bundle.picks)
-        self._changed |= new or clicked or sensed.depth is not None
+        self._changed |= new or clicked or self._told() != told
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
         self._bounded.tidy()
         self._answer_when_due(sensed.stamp_ns, clicked, busy)
+
+    def _told(self) -> tuple[int, int]:
+        """Changes with each factor that enters or leaves."""
+        log = self.engine.solver.log
+        return len(log.factors), len(log.off)
 
     def look_back(self, sensed: Sensed) -> bool:
         """A click in a frame that has passed."""
@@ -289,6 +293,6 @@ class GraphLoop:
         memory = remember(self.engine)
         if memory is None:
             raise SurecutError("nothing to remember yet: no board has a place")
-        save(memory, self._checkpoint, self._rig_sha256)
+        save(memory, self._checkpoint, self._rig_sha256, self._answer)
         self.counts["checkpoints"] += 1
         return f"saved to {self._checkpoint}"

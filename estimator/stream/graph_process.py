@@ -2,39 +2,25 @@
 
 import queue
 import traceback
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...factors.errors import SurecutError
-from ...factors.rig import Rig
 from ..sensing import Sensed
-from ..validated_range import ValidatedRange
 from .graph_loop import GraphLoop
 from .memory import load
-from .parent import end_with_parent
-from .settings import StreamSettings
-from .wire import Died, Done, LateClick, Order, Ready
+from .parent import GRAPH_NICE, end_with_parent, give_way
+from .wire import Died, Done, GraphTask, LateClick, Order, Ready
 
 BUSY = 20
 """Stamps that wait from which on answers are rarer."""
 
 
-@dataclass(frozen=True, slots=True)
-class GraphTask:
-    """What the process is started with."""
-
-    rig: Rig
-    settings: StreamSettings
-    prior: Path | None
-    """A checkpoint to begin with."""
-    checkpoint: Path | None
-    validated: ValidatedRange | None
-
-
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     end_with_parent()
+    if not task.patient:
+        give_way(GRAPH_NICE)
     try:
         loop = _started(task, out, task.prior)
         out.put(Ready("graph"))

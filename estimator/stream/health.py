@@ -29,6 +29,7 @@ REFUSALS = {
     "malformed": "messages that cannot be decoded",
     "oversized": "messages beyond the size limit",
     "not_finite": "messages with numbers that are not finite",
+    "dropped": "messages came faster than they are worked on; the oldest were dropped",
     "unstamped": "messages without header.stamp; set it in the driver",
 }
 """Counters of the sources that are faults while they grow."""
@@ -58,8 +59,8 @@ class Monitor:
         self._topics: dict[str, _Topic] = {}
         self._since: dict[str, tuple[int, str, Severity]] = {}
         self._began_ns: int | None = None
-        self._grown: dict[str, tuple[int, int, str]] = {}
-        """By counter: its value, when it last grew, the topic."""
+        self._grown: dict[tuple[str, str, str], tuple[int, int]] = {}
+        """By reason, topic and who counted: the number, and when it last grew."""
         self._jumped: dict[str, tuple[int, float]] = {}
         """By topic: when its clock jumped, by receipt, and by how much (s)."""
         self._answer: Answer | None = None
@@ -95,13 +96,17 @@ class Monitor:
         """Whether each of the last moments lacked one of its two images."""
         self._unpaired = sum(unpaired) / len(unpaired) if len(unpaired) == unpaired.maxlen else 0.0
 
-    def counted(self, by_topic: Mapping[str, Mapping[str, int]], now_ns: int) -> None:
-        """The sources' refusals, by reason and topic."""
+    def counted(self, by_topic: Mapping[str, Mapping[str, int]], now_ns: int, whose: str = "") -> None:
+        """Refusals, by reason and topic.
+
+        Args:
+            whose: who counted them: two sources may have one topic.
+        """
         for reason in REFUSALS.keys() & by_topic.keys():
             for topic, value in by_topic[reason].items():
-                key = f"{reason} {topic}"
-                if value > self._grown.get(key, (0, 0, ""))[0]:
-                    self._grown[key] = value, now_ns, topic
+                key = reason, topic, whose
+                if value > self._grown.get(key, (0, 0))[0]:
+                    self._grown[key] = value, now_ns
 
     def answered(self, answer: Answer) -> None:
         self._answer = answer
@@ -182,9 +187,8 @@ class Monitor:
 
     def _refused(self, now_ns: int) -> list[tuple[str, str, Severity]]:
         faults = []
-        for key, (value, at_ns, topic) in sorted(self._grown.items()):
+        for (reason, topic, _), (value, at_ns) in sorted(self._grown.items()):
             if now_ns - at_ns < RECENT_NS:
-                reason = key.split(" ", 1)[0]
                 faults.append((f"{reason} {topic}", f"{topic}: {value} {REFUSALS[reason]}", Severity.WARNING))
         return faults
 

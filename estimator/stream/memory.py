@@ -17,18 +17,24 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.camera import CameraModel
-from ...factors.errors import SurecutError
+from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
+from ...io.reader import LogReader
+from ..batch import BatchSolution, without_factors
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
 from ..output_files import write_text
 from ..pipes import known_cylinder, known_point
+from .remembered import KEY, to_data
 from .variables import LONG_LIVED, long_lived
+from .wire import Answer
 
 Float = NDArray[np.float64]
 
 FORMAT = 1
+MARK, HEAD = '"surecut_memory"', 40
+"""What a checkpoint begins with, and within how many characters."""
 
 
 class MemoryFileError(SurecutError):
@@ -55,15 +61,22 @@ class Memory:
     """Pipes that the machine's depth camera has seen."""
 
 
-def remember(engine: Engine) -> Memory | None:
-    """What an engine knows now; None while it knows no board."""
-    values = engine.state.values
+def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | None:
+    """What an engine knows now; None while it knows no board.
+
+    Args:
+        solution: of the batch refinement, where there has been one.
+    """
     if not engine.boards.any_known() or engine.graph.unsolved:
         return None
+    log, values = engine.solver.log, engine.state.values
+    graph = log.graph()
+    if solution is not None:
+        values, graph = solution.values, without_factors(log, set(solution.outliers))
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
-        prior=gaussian_of(engine.solver.log.graph(), values, long_lived(values)),
+        prior=gaussian_of(graph, values, long_lived(values)),
         cameras=dict(engine.cameras),
         boards=[
             {
@@ -148,24 +161,49 @@ def _seen_by_machine(engine: Engine) -> set[str]:
 # The file -------------------------------------------------------------------------------------------------------------
 
 
-def save(memory: Memory, path: Path, rig_sha256: str) -> None:
-    """Writes it whole or not at all: to a file beside it, then renamed."""
-    write_text(path, to_json(memory, rig_sha256))
+def save(memory: Memory, path: Path, rig_sha256: str, answer: Answer | None = None) -> None:
+    """Writes it whole or not at all: to a file beside it, then renamed.
+
+    Args:
+        answer: what was said last, see `remembered`.
+    """
+    write_text(path, to_json(memory, rig_sha256, answer))
 
 
 def load(path: Path) -> Memory:
-    """
+    """From a checkpoint, or from a result of a recording (JSON or MCAP).
+
     Raises:
-        MemoryFileError: it cannot be read, or is no checkpoint.
+        MemoryFileError: it cannot be read, or is neither.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        if path.suffix == ".mcap":
+            with LogReader(path) as reader:
+                text = (reader.attachment("result.json") or b"").decode("utf-8")
+        else:
+            text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError, LogError) as error:
         raise MemoryFileError(f"{path}: cannot be read ({error}); remove it to start without memory") from error
-    return from_json(text, str(path))
+    return from_json(_of_result(text, str(path)), str(path))
 
 
-def to_json(memory: Memory, rig_sha256: str) -> str:
+def _of_result(text: str, name: str) -> str:
+    """The memory in a result; another text as it is."""
+    if MARK in text[:HEAD]:
+        return text
+    try:
+        data = json.loads(text)
+        if "trajectory" not in data:
+            return text
+        found = str(data.get("memory", ""))
+    except (ValueError, AttributeError, TypeError):
+        return text
+    if not found:
+        raise MemoryFileError(f"{name}: holds no memory of boards and machine; run `surecut optimise` again")
+    return found
+
+
+def to_json(memory: Memory, rig_sha256: str, answer: Answer | None = None) -> str:
     prior = memory.prior
     body = {
         "surecut_memory": FORMAT,
@@ -186,6 +224,8 @@ def to_json(memory: Memory, rig_sha256: str) -> str:
         "inset_sigma_px": memory.inset_sigma_px,
         "cylinders": memory.cylinders,
     }
+    if answer is not None:
+        body[KEY] = to_data(answer)
     return json.dumps(body, allow_nan=False) + "\n"
 
 

@@ -6,14 +6,16 @@ camera passes at once.
 """
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ...factors.rig import Rig
-from ...io.messages import ImageBody, Message, PickBody
+from ...io.live.tally import Tally
+from ...io.messages import CameraInfoBody, ImageBody, Message, PickBody
 from ...io.pairing import StereoPair
-from ..sensing import Item, plain
+from ..items import Item, plain
 
 TOLERANCE_NS = 1_000_000
 """Stamps nearer to each other than this are one moment."""
@@ -62,6 +64,7 @@ class LiveOrder:
         self._steps: deque[int] = deque(maxlen=RHYTHM)
         self._offset_ns: int | None = None
         self._strayed: list[int] = []
+        self._strays = Tally()
         self.counts: Counter[str] = Counter()
         """`late`, `repeated`, `unpaired`, `paired`, `stamp_outlier`, `clock_jumps`."""
         self.unpaired: deque[bool] = deque(maxlen=40)
@@ -74,8 +77,9 @@ class LiveOrder:
             now_ns: time of receipt.
         """
         message = plain(message)
-        if not self._believed(message.stamp_ns, now_ns):
+        if not isinstance(message.body, PickBody | CameraInfoBody) and not self._believed(message.stamp_ns, now_ns):
             self.counts["stamp_outlier"] += 1
+            self._strays.add("stamp_outlier", message.topic)
             return []
         if isinstance(message.body, PickBody) and message.body.camera != "b_rgb":
             self._picks = [*self._picks, (message, now_ns)][-WAITING:]
@@ -94,6 +98,10 @@ class LiveOrder:
             moment.changed_ns = now_ns
         return self.due(now_ns)
 
+    def strays(self) -> Mapping[str, int]:
+        """Messages whose stamps were not believed, by topic."""
+        return self._strays.by_topic().get("stamp_outlier", {})
+
     def due(self, now_ns: int) -> list[list[Item]]:
         """Groups that are ready, or have waited long enough."""
         groups: list[list[Item]] = []
@@ -110,7 +118,10 @@ class LiveOrder:
         return [*groups, *self._late_picks(FOREVER)]
 
     def _believed(self, stamp_ns: int, now_ns: int) -> bool:
-        """Is the stamp near where this stream's clock is? One message from the future would make all others late."""
+        """Is the stamp near where this stream's clock is? One message from the future would make all others late.
+
+        Clicks may be in images of a while ago, and calibrations carry any stamp: they are not asked.
+        """
         if stamp_ns <= 0:
             return True  # a click in the newest image has no stamp of its own
         offset = stamp_ns - now_ns

@@ -1,12 +1,17 @@
-"""A child process ends with its parent, however that ended: a killed parent cannot tell."""
+"""What a child process does for its parent: it ends with it, and lets it go first."""
 
 import multiprocessing
 import os
+import signal
 import threading
+
+LOOK_NICE, GRAPH_NICE = 5, 10
+"""Niceness: the pose of the camera goes before markers and surfaces, and these before the graph."""
 
 
 def end_with_parent() -> None:
-    """Call once in the child."""
+    """Call once in the child: a parent that was killed cannot tell."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a keyboard tells all of them; the parent ends the others in order
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -16,3 +21,11 @@ def end_with_parent() -> None:
         os._exit(0)  # queues may be full, and nobody is left to read them
 
     threading.Thread(target=watch, name="surecut-parent", daemon=True).start()
+
+
+def give_way(niceness: int) -> None:
+    """Call once in the child: others on the same cores go first."""
+    try:
+        os.nice(niceness)
+    except (AttributeError, OSError):  # where there is no niceness, all are alike
+        return

@@ -3,8 +3,6 @@
 import json
 from typing import TYPE_CHECKING
 
-from ..points_in_base import radius95
-
 if TYPE_CHECKING:
     from .stream import Stream
 
@@ -47,7 +45,7 @@ def summary_lines(stream: "Stream") -> list[str]:
         x, y, z = 1e3 * point.position_m
         lines.append(
             f"{point.id} ({point.role}) at ({x:.1f}, {y:.1f}, {z:.1f}) mm in b, "
-            f"95 % within {1e3 * radius95(point.covariance_m2):.1f} mm"
+            f"95 % within {1e3 * point.radius95_m:.1f} mm"
         )
     if stream.last_problem:
         lines.append(f"last problem: {stream.last_problem}")

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from ..bounded import Limits
+from ..limits import Limits
 
 MS = 1_000_000
 S = 1_000_000_000
@@ -17,10 +17,16 @@ class StreamSettings:
     queue_count: int = 400
     queue_bytes: int = 256 << 20
     """Between the receiving threads and the ordering: the oldest messages beyond are dropped and counted."""
-    sensing_ahead: int = 4
-    """Groups of messages that are handed to the front ends at a time: newer ones wait where they can be dropped."""
+    tracking_ahead: int = 4
+    """Groups of messages that are handed to the tracking at a time: newer ones wait where they can be dropped."""
+    looking_ahead: int = 100
+    """Groups that the other front ends may be behind the tracking."""
     graph_ahead: int = 200
     """Stamps that the graph may be behind the front ends."""
+    thin_from: int = 40
+    """Stamps behind from which on the graph gets fewer frames."""
+    thin_ns: int = 500 * MS
+    """Between keyframes that it gets then."""
     recent_ns: int = 15 * S
     """How far back a click may be: pictures of so long are kept."""
     answer_period_ns: int = 400 * MS

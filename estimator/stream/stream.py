@@ -1,8 +1,9 @@
-"""The streaming estimator: sources in, sinks out, two processes between, for as long as there is work."""
+"""The streaming estimator: sources in, sinks out, three processes between, for as long as there is work."""
 
+import sys
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,39 +13,35 @@ import numpy as np
 from ...factors.errors import SurecutError
 from ...factors.rig import Rig
 from ...io.live.bounded import BoundedQueue, is_urgent, message_size
-from ...io.live.interfaces import (
-    Clock,
-    Command,
-    Freeze,
-    LiveImage,
-    Outline,
-    Pick,
-    Reply,
-    Reset,
-    Save,
-    Sink,
-    Source,
-)
-from ...io.messages import CameraInfoBody, ImageBody, Message, PickBody
-from ..sensing import COLOUR_PERIOD_NS, Item, plain
+from ...io.live.interfaces import Clock, Command, Freeze, LiveImage, Pick, Reply, Reset, Save, Sink, Source
+from ...io.live.tally import Tally
+from ...io.messages import ImageBody, Message, PickBody
+from ..items import Item, plain
 from ..validated_range import ValidatedRange
-from .children import Children
-from .follower import Followed, Follower
-from .graph_process import GraphTask
-from .health import Monitor
+from .arrivals import Arrivals
+from .children import NAMES, Children
+from .follower import Followed
 from .latency import Latencies
 from .ordering import LiveOrder
 from .publisher import update_of
+from .remembered import remembered
 from .settings import StreamSettings
-from .wire import Answer, Died, Done, Frame, Group, Order, Ready, Worked
+from .situation import Situation
+from .wire import Answer, Died, Done, Frame, GraphTask, Group, Order, Ready, Worked
 
 TICK_S = 0.003
+SWITCH_S = 0.0005
+"""A thread that has a pose to hand on waits at most about so long for one that is busy."""
 IDLE_PUBLISH_NS = 500_000_000
 """Without frames, the state is published so often, so that age and health are seen."""
+COUNT_NS = 250_000_000
+"""Counters are gathered so often."""
 RESTARTS = 5
 """More within a minute: the fault does not go away by itself."""
 FINISH_S = 120.0
 START_S = 120.0
+START_PUBLISH_S = 0.1
+"""While the processes start, what is known is published so often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,35 +79,28 @@ class Stream:
         self._clock, self._live = clock, live
         self._patient = any(source.patient for source in sources)
         self._checkpoint = checkpoint
-        begin = checkpoint if checkpoint is not None and checkpoint.exists() else prior
-        self._begin = begin
-        self._children = Children(GraphTask(rig, settings, begin, checkpoint, validated))
+        self._begin = checkpoint if checkpoint is not None and checkpoint.exists() else prior
+        task = GraphTask(rig, settings, self._begin, checkpoint, validated, self._patient)
+        self._children = Children(task, self._hear)
         self._queue: BoundedQueue[Arrival] = BoundedQueue(settings.queue_count, settings.queue_bytes)
         self._orders: deque[Order] = deque()
         self._order = LiveOrder(rig, settings.window_ns)
-        self._follower = Follower()
-        self._monitor = Monitor(rig, settings)
-        self._lock = threading.Lock()
-        """Over what both threads touch: monitor, follower, answer, the newest times."""
-        self._answer: Answer | None = None
-        self._now_ns = 0
-        self._heard_at = time.monotonic_ns()
-        self._stamp_ns = 0
-        self._arrived: OrderedDict[int, int] = OrderedDict()
-        self._pictures: OrderedDict[int, Message] = OrderedDict()
-        self._next_image_ns = 0
-        self._known: dict[str, CameraInfoBody] = {}
-        self._next_colour_ns = 0
+        self._arrivals = Arrivals(rig, settings)
+        self._situation = Situation(rig, settings, live)
         self._published_at = 0
         self._stopping = threading.Event()
         self._finished = threading.Event()
-        self._ready = threading.Event()
+        self._ready: set[str] = set()
+        self._all_ready = threading.Event()
         self._deaths: list[float] = []
         self.problem: str | None = None
         """Why the stream ended, where it should not have."""
         self.latency = Latencies()
         """From the arrival of a frame's last image to its published pose."""
-        self.counts: dict[str, int] = {}
+        self._parts = {name: Latencies() for name in ("waiting", "tracking", "publishing")}
+        self._tally = Tally()
+        self._counters: dict[str, int] = {}
+        self._counted_at = 0
         self.last_problem = ""
 
     # Run ------------------------------------------------------------------------------------------------------
@@ -121,13 +111,12 @@ class Stream:
         Raises:
             SurecutError: a source or sink cannot work, or the processes die again and again.
         """
-        self._children.start(self._begin)
-        results = threading.Thread(target=self._results, name="surecut-results", daemon=True)
-        results.start()
+        switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
         try:
             for sink in self._sinks:
                 sink.start(self._commanded)
-            self._wait_for_children()
+            self._start_children()
             for source in self._sources:
                 source.start(self._deliver_to(source))
             while not self._stopping.is_set():
@@ -143,18 +132,27 @@ class Stream:
             self._children.stop()
             for sink in self._sinks:
                 sink.stop()
+            sys.setswitchinterval(switch_s)
         if self.problem is not None:
             raise SurecutError(self.problem)
 
-    def _wait_for_children(self) -> None:
-        """Messages that come before anybody can work on them would only be old when they are."""
+    def _start_children(self) -> None:
+        """Messages that come before anybody can work on them would only be old when they are. Meanwhile whoever listens
+        gets what was known at the last checkpoint."""
+        known = None if self._begin is None else remembered(self._begin, self.rig)
+        if known is not None:
+            self._situation.answered(known)
+        starting = threading.Thread(target=self._children.start, args=(self._begin,), name="surecut-start", daemon=True)
+        starting.start()
         until = time.monotonic() + START_S
-        while not self._ready.wait(0.1) and not self._stopping.is_set():
-            dead = self._children.dead()
+        while not self._all_ready.wait(START_PUBLISH_S) and not self._stopping.is_set():
+            self._publish(None)
+            dead = None if starting.is_alive() else self._children.dead()
             if dead is not None or time.monotonic() > until:
                 raise SurecutError(
                     f"the {dead or 'processes'} did not start; {self.last_problem or 'is there memory?'}"
                 )
+        starting.join()
 
     def stop(self) -> None:
         """Ends the run; from any thread or signal handler."""
@@ -162,16 +160,20 @@ class Stream:
         self._queue.close()
 
     def pids(self) -> list[int]:
-        """Front ends' and graph's processes."""
+        """Processes of the tracking, the other front ends and the graph."""
         return self._children.pids()
 
     def stamp_ns(self) -> int:
         """Newest stamp that was worked on."""
-        return self._stamp_ns
+        return self._situation.stamp_ns()
 
     def answer(self) -> Answer | None:
         """What the graph said last."""
-        return self._answer
+        return self._situation.answer()
+
+    def counts(self) -> dict[str, int]:
+        """What has happened so far, by name."""
+        return dict(self._tally.totals())
 
     def _deliver_to(self, source: Source) -> Callable[[Message], None]:
         put = self._queue.put_waiting if source.patient else self._queue.put
@@ -194,45 +196,16 @@ class Stream:
             self._tick()
             return True
         message = plain(arrival.message)
-        now_ns = self._noted(message, arrival.arrived_ns)
-        if not self._redundant(message):
+        now_ns = self._situation.heard(message, arrival.arrived_ns)
+        self._arrivals.note(message, arrival.arrived_ns)
+        if not self._arrivals.redundant(message):
             for group in self._order.add(message, now_ns):
                 self._send(group)
         return True
 
-    def _noted(self, message: Message, arrived_ns: int) -> int:
-        with self._lock:
-            self._now_ns = max(self._now_ns, message.log_time_ns)
-            self._heard_at = arrived_ns
-            self._monitor.heard(message, self._now_ns)
-            if isinstance(message.body, ImageBody) and message.stamp_ns > 0:
-                self._arrived[message.stamp_ns] = arrived_ns  # the later of the two stays
-                while len(self._arrived) > 4000:
-                    self._arrived.popitem(last=False)
-            return self._now_ns
-
-    def _redundant(self, message: Message) -> bool:
-        """Repetitions of a calibration, and colour images beyond what is looked at."""
-        body = message.body
-        if isinstance(body, CameraInfoBody):
-            known = self._known.setdefault(message.topic, body)
-            return known is not body and np.array_equal(known.camera.K, body.camera.K)
-        if isinstance(body, ImageBody) and message.topic == self.rig.cameras.b_rgb.image_topic:
-            if abs(self._next_colour_ns - message.stamp_ns) > 2 * COLOUR_PERIOD_NS:
-                self._next_colour_ns = message.stamp_ns
-            if message.stamp_ns < self._next_colour_ns:
-                return True
-            self._next_colour_ns = message.stamp_ns + COLOUR_PERIOD_NS
-        return False
-
     def _tick(self) -> None:
         """Time goes on without messages, unless a replay stands still."""
-        with self._lock:
-            if self._live and self._now_ns:
-                passed = time.monotonic_ns() - self._heard_at
-                self._heard_at += passed
-                self._now_ns += passed
-            now_ns = self._now_ns
+        now_ns = self._situation.ticked()
         if not self._patient:
             for group in self._order.due(now_ns + 1):  # nothing more comes at this time
                 self._send(group)
@@ -243,25 +216,12 @@ class Stream:
             self._publish(None)
 
     def _send(self, group: list[Item]) -> None:
-        self._keep_picture(group)
+        self._arrivals.keep_picture(group)
         while not self._stopping.is_set() and not self._children.put(Group(group)):
             dead = self._children.dead()
             if dead is not None:
                 self._restart(dead)
                 return
-
-    def _keep_picture(self, group: list[Item]) -> None:
-        """One image now and then for people to look at."""
-        first = group[0]
-        if isinstance(first, Message) or abs(self._next_image_ns - first.stamp_ns) > 5 * self.settings.image_period_ns:
-            self._next_image_ns = min(self._next_image_ns, first.stamp_ns)
-        if isinstance(first, Message) or first.stamp_ns < self._next_image_ns:
-            return
-        self._next_image_ns = first.stamp_ns + self.settings.image_period_ns
-        with self._lock:
-            self._pictures[first.stamp_ns] = first.left
-            while len(self._pictures) > 20:
-                self._pictures.popitem(last=False)
 
     def _end(self) -> None:
         """Everything that waits goes through, and the graph gives its last answer."""
@@ -287,69 +247,63 @@ class Stream:
             self._stopping.set()
             return
         self._children.stop()
-        with self._lock:
-            self._follower.forget()
+        self._situation.astray(forget_answer=False)
         there = self._checkpoint if self._checkpoint is not None and self._checkpoint.exists() else self._begin
-        self._known.clear()
+        self._arrivals.forget_calibrations()
         self._children.start(there)
 
-    # Results (own thread) -------------------------------------------------------------------------------------
+    # Results (a thread for each process) --------------------------------------------------------------------
 
-    def _results(self) -> None:
-        ready: frozenset[str] = frozenset()
-        while True:
-            said = self._children.out.get()
-            if isinstance(said, Frame):
-                self._framed(said)
-            elif isinstance(said, Answer):
-                self._answered(said)
-            elif isinstance(said, Worked):
-                self._worked(said)
-            elif isinstance(said, Done):
-                self._done(said)
-            elif isinstance(said, Ready):
-                ready = ready | {said.who}
-                if len(ready) == 2:
-                    self._ready.set()
-            elif isinstance(said, Died):
-                self.last_problem = f"{said.who}: {said.trace}"
-                self._count("deaths")
+    def _hear(self, said: object) -> None:
+        """Something that one of the processes says."""
+        if isinstance(said, Frame):
+            self._framed(said)
+        elif isinstance(said, Answer):
+            self._publish(self._situation.answered(said))
+            self._count("answers")
+        elif isinstance(said, Worked):
+            self._worked(said)
+        elif isinstance(said, Done):
+            self._done(said)
+        elif isinstance(said, Ready):
+            self._ready.add(said.who)
+            if len(self._ready) == len(NAMES):
+                self._all_ready.set()
+        elif isinstance(said, Died):
+            self.last_problem = f"{said.who}: {said.trace}"
+            self._count("deaths")
 
     def _framed(self, frame: Frame) -> None:
-        with self._lock:
-            followed = self._follower.frame(frame)
-            self._stamp_ns = max(frame.stamp_ns, 0)
-            arrived = self._arrived.pop(frame.stamp_ns, None)
+        followed = self._situation.framed(frame)
+        arrived = self._arrivals.arrived(frame.stamp_ns)
         self._publish(followed)
         if arrived is not None:
-            self.latency.add(time.monotonic_ns() - arrived)
+            now = time.monotonic_ns()
+            self.latency.add(now - arrived)
+            times = arrived, frame.taken_ns, frame.tracked_ns, now
+            for part, began, ended in zip(self._parts.values(), times[:-1], times[1:], strict=True):
+                part.add(ended - began)
         self._count("frames")
         self._count("lost_frames", int(frame.lost))
-
-    def _answered(self, answer: Answer) -> None:
-        with self._lock:
-            self._answer = answer
-            self._stamp_ns = max(self._stamp_ns, answer.stamp_ns)
-            self._monitor.answered(answer)
-            if answer.keyframe_ns is not None and "m" in answer.places:
-                self._follower.anchor(answer.keyframe_ns, answer.places["m"])
-        self._count("answers")
+        self._count("tracking_cpu_us", round(1e6 * frame.cpu_s))
 
     def _worked(self, worked: Worked) -> None:
-        self.counts["sensing_cpu_us"] = self.counts.get("sensing_cpu_us", 0) + round(1e6 * worked.cpu_s)
+        self._count("looking_cpu_us", round(1e6 * worked.cpu_s))
+        self._count("left_out", worked.left_out)
+        self._count("thinned", worked.thinned)
+        for topic in worked.unreadable:
+            self._tally.add("malformed", topic)
         if worked.problem is not None:
             self._count("refused_by_front_ends")
             self.last_problem = worked.problem
-        with self._lock:
-            picture = self._pictures.pop(worked.stamp_ns, None)
+        picture = self._arrivals.picture(worked.stamp_ns)
         if picture is None or not isinstance(picture.body, ImageBody):
             return
-        outlines: tuple[Outline, ...] = worked.outlines.get("m_left", ())
         try:
             pixels = picture.body.pixels()
         except SurecutError:
             return
-        image = LiveImage(picture.topic, picture.stamp_ns, "m_left", pixels, outlines)
+        image = LiveImage(picture.topic, picture.stamp_ns, "m_left", pixels, worked.outlines.get("m_left", ()))
         for sink in self._sinks:
             sink.image(image)
 
@@ -358,21 +312,20 @@ class Stream:
         if done.failed:
             self.last_problem = done.text
         if done.what == "reset":
-            with self._lock:
-                self._follower.forget()
-                self._answer = None
+            self._situation.astray(forget_answer=True)
         if done.what == "finish":
             self._publish(None)
             self._finished.set()
 
     def _publish(self, followed: Followed | None) -> None:
-        with self._lock:
-            self._monitor.paired(self._order.unpaired)
-            for source in self._sources:
-                self._monitor.counted(source.by_topic(), self._now_ns)
-            health = self._monitor.health(self._now_ns, self._stamp_ns)
-            stamp_ns, answer = self._stamp_ns, self._answer
-        update = update_of(answer, followed, stamp_ns, self._clock(), health, self.counters(), self.settings)
+        own = {
+            "dropped": self._queue.dropped_by_topic(),
+            "stamp_outlier": self._order.strays(),
+            "malformed": self._tally.by_topic().get("malformed", {}),
+        }
+        health = self._situation.health(self._order.unpaired, self._sources, own)
+        answer, stamp_ns = self._situation.answer(), self._situation.stamp_ns()
+        update = update_of(answer, followed, stamp_ns, self._clock(), health, self._recent_counters(), self.settings)
         for sink in self._sinks:
             sink.publish(update)
         self._published_at = time.monotonic_ns()
@@ -383,7 +336,7 @@ class Stream:
         """From a network thread: queued, and answered at once."""
         if isinstance(command, Pick):
             body = PickBody(command.camera, command.point_id, command.role, np.array(command.px), command.sigma_px)
-            message = Message(self.rig.picks_topic, self._now_ns, command.stamp_ns, command.camera, body)
+            message = Message(self.rig.picks_topic, self._situation.now_ns(), command.stamp_ns, command.camera, body)
             taken = self._queue.put(Arrival(message, time.monotonic_ns()), message.topic, 0, urgent=True)
             return Reply(taken, "pick queued" if taken else "the stream is ending")
         what = {Reset: "reset", Save: "save"}.get(type(command))
@@ -400,16 +353,27 @@ class Stream:
             self._orders.popleft()
 
     def _count(self, name: str, number: int = 1) -> None:
-        self.counts[name] = self.counts.get(name, 0) + number
+        if number:
+            self._tally.add(name, number=number)
+
+    def _recent_counters(self) -> dict[str, int]:
+        now = time.monotonic_ns()
+        if now - self._counted_at > COUNT_NS:
+            self._counted_at = now
+            self._counters = self.counters()
+        return self._counters
 
     def counters(self) -> dict[str, int]:
         """Totals of the whole process."""
-        found = {**self.counts, **self.latency.counters("latency"), "queue_dropped": self._queue.dropped()}
+        found = {**self._tally.totals(), **self.latency.counters("latency"), "queue_dropped": self._queue.dropped()}
+        for name, part in self._parts.items():
+            found |= part.counters(f"latency_{name}")
         found |= {f"order_{name}": number for name, number in self._order.counts.items()}
         found["graph_behind"] = self._children.backlog()
-        if self._answer is not None:
-            found |= {f"graph_{name}": number for name, number in self._answer.counts.items()}
-            found["graph_cpu_us"] = round(1e6 * self._answer.cpu_s)
+        answer = self.answer()
+        if answer is not None:
+            found |= {f"graph_{name}": number for name, number in answer.counts.items()}
+            found["graph_cpu_us"] = round(1e6 * answer.cpu_s)
         for i, source in enumerate(self._sources):
             found |= {f"source{i}_{name}": number for name, number in source.counters().items()}
         return found

@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision import Decision
-from ..points_in_base import radius95
 from .settings import S, StreamSettings
 
 Float = NDArray[np.float64]
@@ -26,11 +25,6 @@ def grown(covariance_m2: Float, position_m: Float, age_s: float, settings: Strea
     p = np.asarray(position_m, float)
     across = float(p @ p) * np.eye(3) - np.outer(p, p)
     return covariance_m2 + shift * np.eye(3) + turn * across
-
-
-def radius_of(covariance_m2: Float) -> float:
-    """Radius that holds 95 %."""
-    return radius95(covariance_m2)
 
 
 def verdict_of(decision: Decision | None, now_ns: int) -> tuple[str, str]:

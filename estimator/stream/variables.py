@@ -4,7 +4,7 @@ import gtsam
 
 from ...factors import keys
 
-LONG_LIVED = "kedgbfhqpuvr"
+LONG_LIVED = "kedgbfhqpuvrw"
 """Calibration, depth, machine, boards with page and corners, points, and pipes, by the letter of their key."""
 
 

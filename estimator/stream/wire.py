@@ -3,15 +3,23 @@ children; nothing that comes from outside is ever unpickled."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...factors.measurements import Event
+from ...factors.measurements import Event, StereoFrame
+from ...factors.rig import Rig
 from ...io.live.interfaces import Outline
 from ..decision import Decision
+from ..items import Item
 from ..result import CalibrationEstimate, PipeEstimate, PointEstimate
-from ..sensing import Item, Sensed
+from ..validated_range import ValidatedRange
+from .settings import StreamSettings
+
+if TYPE_CHECKING:
+    from ..sensing import Sensed  # loads all front ends
 
 Float = NDArray[np.float64]
 
@@ -24,8 +32,17 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
+class Tracked:
+    """From the tracking to the other front ends: a group, and what became of its pair."""
+
+    items: list[Item]
+    frame: StereoFrame | None
+    """None where there is no pair, or none that can be used."""
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
-    """From the front ends at once: how the mobile camera moved."""
+    """From the tracking at once: how the mobile camera moved."""
 
     stamp_ns: int
     last_T_this: Float
@@ -33,11 +50,17 @@ class Frame:
     is_keyframe: bool
     lost: bool
     inliers: int
+    taken_ns: int = 0
+    """When the tracking took the pair, by the monotonic clock, which is the same for all processes."""
+    tracked_ns: int = 0
+    """When it was done."""
+    cpu_s: float = 0.0
+    """Processor time that it took."""
 
 
 @dataclass(frozen=True, slots=True)
 class Worked:
-    """From the front ends: a group is done."""
+    """From the front ends: a group is done, or could not be tracked."""
 
     outlines: Mapping[str, tuple[Outline, ...]] = field(default_factory=dict)
     """Markers seen, by camera."""
@@ -47,13 +70,19 @@ class Worked:
     picks: int = 0
     cpu_s: float = 0.0
     """Processor time that it took."""
+    left_out: int = 0
+    """Images of the machine's camera that were left out, because the front ends are behind."""
+    unreadable: tuple[str, ...] = ()
+    """Topics of images in it that cannot be decoded."""
+    thinned: int = 0
+    """Frames that the graph was spared, see `thinning`."""
 
 
 @dataclass(frozen=True, slots=True)
 class LateClick:
     """Clicks in a frame that has passed, with all that is needed to make it a keyframe after the fact."""
 
-    sensed: Sensed
+    sensed: "Sensed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +150,17 @@ class Died:
 
     who: str
     trace: str
+
+
+@dataclass(frozen=True, slots=True)
+class GraphTask:
+    """What the graph's process is started with."""
+
+    rig: Rig
+    settings: StreamSettings
+    prior: Path | None
+    """A checkpoint to begin with."""
+    checkpoint: Path | None
+    validated: ValidatedRange | None
+    patient: bool = False
+    """The sources wait, so that no pose is late."""

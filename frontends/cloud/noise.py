@@ -21,6 +21,8 @@ DepthModel = Literal["kinect_v1", "kinect_v2", "azure", "realsense"]
 SMOOTH_SHARE = 0.005
 """Slowly varying depth error across the image, as a part of the depth: lens and disparity distortion that factory
 calibration leaves (Herrera, Kannala, Heikkila 2012, find up to 1 % for Kinect v1)."""
+SMOOTH_RAD = np.deg2rad(15.0)
+"""Part of the view over which that counts as one error."""
 _REALSENSE_Z2 = 0.08 / (640.0 * 0.05)
 _MESSAGE_STEP_M = 0.001
 

@@ -21,6 +21,8 @@ LOOSE_M, LOOSE_RAD = 3.0, 3.0
 """Directions that the pairs leave free keep the guess: so wide a prior informs of nothing."""
 SAME_SIDE_COSINE = 0.1
 VIEW_RAD = np.deg2rad(1.5)
+"""Samples so near to a point's direction tell what the depth camera sees there; coarser cameras have wider spacing."""
+VIEW_SAMPLES = 4
 CLEAR_M = 0.12
 """A point so far before a surface, beyond its own noise, stands where the depth camera sees through."""
 FEWEST_SEEN_SHARE = 0.6
@@ -134,8 +136,13 @@ def _visibility(points: MapPoints, cloud: CloudFrame, pose: Float) -> tuple[int,
     b_p = (points.points_m - pose[:3, 3]) @ pose[:3, :3]
     known = b_p[:, 2] > 0.3
     b_p, sigma = b_p[known], points.sigma_m[known]
-    directions = KDTree(cloud.points_m[:, :2] / cloud.points_m[:, 2:])
-    distance, index = directions.query(b_p[:, :2] / b_p[:, 2:], k=4, distance_upper_bound=float(VIEW_RAD))
+    if len(cloud.points_m) <= VIEW_SAMPLES:
+        return 0, 0
+    samples = cloud.points_m[:, :2] / cloud.points_m[:, 2:]
+    directions = KDTree(samples)
+    apart = np.asarray(directions.query(samples, k=VIEW_SAMPLES + 1)[0])[:, -1]
+    reach = max(float(VIEW_RAD), 1.5 * float(np.median(apart)))
+    distance, index = directions.query(b_p[:, :2] / b_p[:, 2:], k=VIEW_SAMPLES, distance_upper_bound=reach)
     hit = np.isfinite(np.asarray(distance)[:, -1])
     rows = np.asarray(index)[hit]
     depth = cloud.points_m[rows, 2]

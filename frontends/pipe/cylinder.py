@@ -16,6 +16,8 @@ Bool = NDArray[np.bool_]
 
 _SAMPLE, _THIN = 800, 700
 """Points with normals for the hypotheses, and points that choose among these."""
+_SETTLED = 1e-5
+"""m and rad: a thirtieth of the surest cylinder's sigmas."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +157,7 @@ class _Fit:
             # The scatter about the surface decides when it is larger than the sensor's own sigma.
             middle = 1.4826 * float(np.median(np.abs(residual[inlier]) / sigma[inlier]))
             scatter = sigma * float(np.clip(middle, 0.5, 1.6))
-            if step > 3 and np.abs(change).max() < 1e-6:
+            if step > 3 and np.abs(change).max() < _SETTLED:
                 break
         covariance, independent = _covariance(points, axis, inlier, scatter, prior)
         residual, _ = axis.residuals(points)

@@ -156,11 +156,12 @@ def depth_response(points: Float, fit: CylinderFit) -> Float:
 
 def _fitted(points: Float, sigma: Float, pipe: PredictedPipe, start: Axis | None) -> CylinderFit | Rejection:
     """A fit from the predicted place, and another one to the points that this leaves near the axis."""
-    first = CylinderConfig(points=_FIRST, check_halves=False)
-    fit = fit_cylinder(points, sigma, (pipe.point_a_m, pipe.axis), None, first, start=start)
+    first, few = CylinderConfig(points=_FIRST, check_halves=False), _some(len(points), _FIRST)
+    fit = fit_cylinder(points[few], sigma[few], (pipe.point_a_m, pipe.axis), None, first, start=start)
     if isinstance(fit, Rejection):
         return fit
-    near = _within(points, fit.point_a_m, fit.point_b_m, 1.5 * fit.radius_m, 0.2)
+    near = np.flatnonzero(_within(points, fit.point_a_m, fit.point_b_m, 1.5 * fit.radius_m, 0.2))
+    near = near[_some(len(near), _SECOND)]
     middle = 0.5 * (fit.point_a_m + fit.point_b_m)
     second = CylinderConfig(points=_SECOND)
     again = fit_cylinder(
@@ -169,8 +170,15 @@ def _fitted(points: Float, sigma: Float, pipe: PredictedPipe, start: Axis | None
     if isinstance(again, Rejection):
         return again
     inliers = np.zeros(len(points), bool)
-    inliers[np.flatnonzero(near)[again.inliers]] = True
+    inliers[near[again.inliers]] = True
     return replace(again, inliers=inliers)
+
+
+def _some(count: int, most: int) -> NDArray[np.int64]:
+    """Indices of at most so many points, drawn: even steps could all fall into the same columns of an image."""
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).permutation(count)[:most])
 
 
 def _moved_to(points: Float, pipe: PredictedPipe) -> Axis:

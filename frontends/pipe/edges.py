@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..median import median
+
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
@@ -155,7 +157,7 @@ def _refined(
     slope, shift = _straight(along, where)
     for _ in range(2):
         off = np.abs(where - slope * along - shift)
-        keep = off <= max(2.5 * float(np.median(off)), 0.4)
+        keep = off <= max(2.5 * median(off), 0.4)
         if keep.sum() >= 2:
             slope, shift = _straight(along[keep], where[keep])
     turn = float(np.arctan(slope))

@@ -1,18 +1,20 @@
 """Sub-pixel fit of the occluding edges of a pipe, see `limb_model` for what they look like."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..covariance import larger
+from ..median import median
 from .limb_model import SHADING_TERMS, EdgeModel, EdgePixels, EdgeStates, linearised
 
 Float = NDArray[np.float64]
 
 _STRETCH_PX = 5.0
-_ITERATIONS = 16
+_ITERATIONS, _STAGE = 16, 4
+"""Steps altogether, and of each early stage."""
 _FARTHEST_PX = 2.6
 """The fit may move the line so far: shading inside can be steeper than the edge that a seed is taken for."""
 _WIDE, _NARROW = (4.5, 5.0), (3.0, 2.5)
@@ -68,21 +70,56 @@ def fit_edges(grey: Float, px: Float, seeds: Sequence[EdgeSeed], noise: float) -
         noise: White noise of the image, grey values.
 
     Returns:
-        Per seed; None where the grey values do not hold such an edge.
+        Per seed; None where the grey values do not hold such an edge. What is to be used as a measurement wants
+        `confirmed_edges` as well.
     """
+    found = _fitted(grey, px, seeds, noise, _WIDE)
+    return [None if one is None else _result(seed, *one) for seed, one in zip(seeds, found, strict=True)]
+
+
+def confirmed_edges(
+    grey: Float, px: Float, seeds: Sequence[EdgeSeed], fits: Sequence[EdgeFit], noise: float
+) -> list[EdgeFit | None]:
+    """The same edges fitted in a narrower window: what the two do not agree on is the model's error, not noise.
+
+    Returns:
+        The given fits with a covariance that holds the disagreement; None where the narrow window finds no edge.
+    """
+    found = _fitted(grey, px, seeds, noise, _NARROW)  # from the seeds again: who ends elsewhere is unsure
+    return [
+        None if one is None else replace(fit, covariance=fit.covariance + _disagreement(seed, fit, one[1]))
+        for seed, fit, one in zip(seeds, fits, found, strict=True)
+    ]
+
+
+def _fitted(
+    grey: Float, px: Float, seeds: Sequence[EdgeSeed], noise: float, window: tuple[float, float]
+) -> list[tuple[EdgePixels, EdgeStates] | None]:
+    """Pixels and converged state of every edge."""
     noise = max(noise, 0.3)
-    gathered = [[_gather(grey, px, seed, noise, window) for window in (_WIDE, _NARROW)] for seed in seeds]
-    whole = [i for i, tables in enumerate(gathered) if all(table is not None for table in tables)]
-    fits: list[EdgeFit | None] = [None] * len(seeds)
-    if not whole:
-        return fits
-    pixels = _joined([table for i in whole for table in gathered[i] if table is not None], noise)
+    gathered = [_gather(grey, px, seed, noise, window) for seed in seeds]
+    parts = [table for table in gathered if table is not None]
+    if not parts:
+        return [None] * len(seeds)
+    pixels = _joined(parts, noise)
     state, good = _converged(pixels)
-    for n, i in enumerate(whole):
-        if good[2 * n] and good[2 * n + 1]:
-            wide, narrow = (np.arange(len(good)) == 2 * n + k for k in (0, 1))
-            fits[i] = _result(seeds[i], pixels.only(wide), state.only(wide), state.only(narrow))
-    return fits
+    number = iter(range(len(parts)))
+    found: list[tuple[EdgePixels, EdgeStates] | None] = []
+    for table in gathered:
+        this = None if table is None else next(number)
+        if this is None or not good[this]:
+            found.append(None)
+        else:
+            one = np.arange(len(good)) == this
+            found.append((pixels.only(one), state.only(one)))
+    return found
+
+
+def _disagreement(seed: EdgeSeed, fit: EdgeFit, other: EdgeStates) -> Float:
+    """Covariance (2, 2) of what a fit in another window says otherwise about offset and turn."""
+    offset = float(fit.foot_px @ seed.line[:2] + seed.line[2])
+    turn = float(np.arctan2(seed.line[0] * fit.line[1] - seed.line[1] * fit.line[0], fit.line[:2] @ seed.line[:2]))
+    return np.diag([(offset - float(other.offset[0])) ** 2, (turn - float(other.turn[0])) ** 2])
 
 
 def _converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
@@ -92,7 +129,7 @@ def _converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
     good, moving = np.ones(edges, bool), np.ones(edges, bool)
     linear, weights, damping = linearised(pixels, state), np.ones(len(pixels.grey)), np.full(edges, 1e-3)
     for iteration in range(_ITERATIONS):
-        prior = _prior(iteration // 4)
+        prior = _prior(iteration // _STAGE)
         normal, scores = _normal(pixels, linear, weights, prior)
         gradient = pixels.summed(scores) - prior * state.deviation()
         damped = normal + damping[:, None, None] * (np.eye(normal.shape[1]) * normal)
@@ -113,8 +150,8 @@ def _converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
         weights = np.where(taken, _weights(pixels, linear), weights)
         good &= ~(better & (pixels.summed(weights) < 1.5))
         moving &= good
-        if iteration > 8:
-            moving &= ~(better & (np.abs(step[:, 0]) < 5e-3) & (np.abs(step[:, 1]) < 2e-4))
+        if iteration > 2 * _STAGE:
+            moving &= ~((np.abs(step[:, 0]) < 5e-3) & (np.abs(step[:, 1]) < 2e-4))
     return state, good
 
 
@@ -174,7 +211,7 @@ def _stains(grey: Float, depth: Float, along: Float, weight: Float, inside: floa
         return 20.0
     level, place = ((deep * a).sum(axis=1)[seen] / count[seen] for a in (grey, along))
     left = level - np.polyval(np.polyfit(place, level, 1), place)
-    return max(1.4826 * float(np.median(np.abs(left))), 0.5)
+    return max(1.4826 * median(np.abs(left)), 0.5)
 
 
 def _weights(pixels: EdgePixels, linear: EdgeModel) -> Float:
@@ -198,9 +235,7 @@ def _weights(pixels: EdgePixels, linear: EdgeModel) -> Float:
 def _normal(pixels: EdgePixels, linear: EdgeModel, weights: Float, prior: Float) -> tuple[Float, Float]:
     """Normal equations per edge, (edges, k, k), and scores per stretch, (stretches, k)."""
     scaled = weights / linear.variance
-    turned = linear.jacobian.transpose(0, 2, 1)
-    scores = scaled[:, None] * (turned @ linear.residual[..., None])[..., 0]
-    return pixels.summed(scaled[:, None, None] * (turned @ linear.jacobian)) + np.diag(prior), scores
+    return pixels.summed(scaled[:, None, None] * linear.normal) + np.diag(prior), scaled[:, None] * linear.score
 
 
 def _prior(stage: int) -> Float:
@@ -222,10 +257,9 @@ def _covariance(pixels: EdgePixels, linear: EdgeModel, weights: Float) -> Float:
     return larger(np.asarray(inverse[:2, :2], np.float64), sandwich[:2, :2])
 
 
-def _result(seed: EdgeSeed, pixels: EdgePixels, state: EdgeStates, other: EdgeStates) -> EdgeFit | None:
-    """One edge's fit. What its two windows do not agree on is the model's error, not noise."""
+def _result(seed: EdgeSeed, pixels: EdgePixels, state: EdgeStates) -> EdgeFit | None:
+    """One edge's fit."""
     line, foot_px = seed.line, seed.foot_px
-    spread = np.diag([(state.offset - other.offset)[0] ** 2, (state.turn - other.turn)[0] ** 2])
     linear = linearised(pixels, state)
     weights = _weights(pixels, linear)
     good = (linear.shift_sigma < 0.5) & (weights > 0.1)
@@ -242,7 +276,7 @@ def _result(seed: EdgeSeed, pixels: EdgePixels, state: EdgeStates, other: EdgeSt
     return EdgeFit(
         line=np.array([normal[0], normal[1], -normal @ foot]),
         foot_px=foot,
-        covariance=_covariance(pixels, linear, weights) + spread,
+        covariance=_covariance(pixels, linear, weights),
         extent=(float(start), float(end)),
         blur_px=float(np.exp(state.log_blur[0])),
         contrast=contrast,
@@ -265,5 +299,5 @@ def _sharpness(pixels: EdgePixels, state: EdgeStates, good: NDArray[np.bool_]) -
     changes = [c[np.isfinite(c)] for c in changes]
     if not all(len(c) for c in changes):
         return 0.0, 0.0
-    edge, beyond = (float(np.median(c)) for c in changes)
+    edge, beyond = (median(c) for c in changes)
     return edge, edge / max(edge + beyond, 1e-9)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import gamma, ndtr, pbdv
 
 Float = NDArray[np.float64]
 
@@ -20,6 +20,8 @@ _KINKS_PX = (0.0, 1.8, 3.2)
 """Depths at which the shading may change its slope."""
 SHADING_TERMS = 3 + len(_KINKS_PX)
 _TREND_PX = 40.0
+_BLOCK = 96
+"""Stretches that are worked on together: so many fit into a processor's cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,11 +83,18 @@ class EdgePixels:
     @property
     def starts(self) -> NDArray[np.int64]:
         """First stretch of each edge."""
-        return np.nonzero(np.diff(self.edge, prepend=-1))[0]
+        return np.concatenate(([0], np.flatnonzero(self.edge[1:] != self.edge[:-1]) + 1))
 
     def summed(self, values: Float) -> Float:
         """Per edge, (stretches, ...) to (edges, ...)."""
         return np.add.reduceat(values, self.starts, axis=0)
+
+    def rows(self, start: int, stop: int) -> "EdgePixels":
+        """Some stretches, with the numbers of the edges as they are."""
+        part = slice(start, stop)
+        grey, depth, along, weight = (t[part] for t in (self.grey, self.depth, self.along, self.weight))
+        half_width, evenness = self.half_width[part], self.evenness[part]
+        return EdgePixels(grey, depth, along, weight, half_width, evenness, self.edge[part], self.noise)
 
     def only(self, edges: NDArray[np.bool_]) -> "EdgePixels":
         """The pixels of some edges, (edges,), which are numbered anew."""
@@ -97,12 +106,12 @@ class EdgePixels:
 
 @dataclass(frozen=True, slots=True)
 class EdgeModel:
-    """The model at a state, each stretch's own levels projected out."""
+    """Normal equations of every stretch at a state, its own levels projected out: k = 3 + shading terms."""
 
-    jacobian: Float
-    """(stretches, n, 3 + shading terms): offset, turn, log blur, shading."""
-    residual: Float
-    """(stretches, n)"""
+    normal: Float
+    """(stretches, k, k), J^T J by offset, turn, log blur, shading."""
+    score: Float
+    """(stretches, k), J^T r."""
     shift: Float
     """(stretches,), where each alone would put the edge, px from the line."""
     shift_sigma: Float
@@ -116,7 +125,7 @@ class EdgeModel:
             return linearised(pixels, state)
         rows, part = edges[pixels.edge], linearised(pixels.only(edges), state.only(edges))
         tables = []
-        for name in ("jacobian", "residual", "shift", "shift_sigma", "squares", "variance"):
+        for name in _TABLES:
             table = getattr(self, name).copy()
             table[rows] = getattr(part, name)
             tables.append(table)
@@ -124,23 +133,20 @@ class EdgeModel:
 
     def where(self, taken: NDArray[np.bool_], other: "EdgeModel") -> "EdgeModel":
         """This model for the stretches that are taken, the other's for the rest."""
-        one, three = taken[:, None], taken[:, None, None]
-        return EdgeModel(
-            np.where(three, self.jacobian, other.jacobian),
-            np.where(one, self.residual, other.residual),
-            np.where(taken, self.shift, other.shift),
-            np.where(taken, self.shift_sigma, other.shift_sigma),
-            np.where(taken, self.squares, other.squares),
-            np.where(taken, self.variance, other.variance),
-        )
+        tables = []
+        for name in _TABLES:
+            mine, others = getattr(self, name), getattr(other, name)
+            tables.append(np.where(taken.reshape(-1, *[1] * (mine.ndim - 1)), mine, others))
+        return EdgeModel(*tables)
+
+
+_TABLES = ("normal", "score", "shift", "shift_sigma", "squares", "variance")
 
 
 def _limb_table() -> tuple[Float, Float]:
-    """sqrt(max(x, 0)) blurred by a Gaussian of sigma 1, tabulated."""
+    """sqrt(max(x, 0)) blurred by a Gaussian of sigma 1, tabulated: a parabolic cylinder function (DLMF 12.5.1)."""
     x = np.linspace(-6.0, 24.0, 1201)
-    fine = np.linspace(-6, 6, 2401)
-    kernel = np.exp(-0.5 * fine**2)
-    return x, (np.sqrt(np.maximum(x[:, None] - fine[None, :], 0)) @ kernel) / kernel.sum()
+    return x, gamma(1.5) / np.sqrt(2 * np.pi) * np.exp(-0.25 * x**2) * pbdv(-1.5, -x)[0]
 
 
 _LIMB_X, _LIMB_Y = _limb_table()
@@ -149,36 +155,42 @@ _LIMB_SLOPE = np.gradient(_LIMB_Y, _LIMB_X)
 
 def linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     """Model and derivatives of all edges at a state."""
+    blocks = [_linearised(pixels.rows(i, i + _BLOCK), state) for i in range(0, len(pixels.edge), _BLOCK)]
+    return EdgeModel(*(np.concatenate([getattr(block, name) for block in blocks]) for name in _TABLES))
+
+
+def _linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     edge = pixels.edge
     blur = np.exp(state.log_blur)[edge, None]
     tau = pixels.depth + state.offset[edge, None] - state.turn[edge, None] * pixels.along
     x = tau / blur
     step, bell = ndtr(x), _bell(x)
+    weight, evenness = pixels.weight, pixels.evenness
     shading, by_depth, by_width = _shading(tau, x, step, bell, pixels.along, blur, pixels.half_width[:, None])
-    coefficients = state.shading[edge, :, None]
+    coefficients = state.shading[edge, None, :]
     ramp = -tau * (1 - step) + blur * bell
-    basis = np.stack((1 - step, ramp, step), axis=2) * pixels.weight[..., None]
+    basis = np.stack((1 - step, ramp, step), axis=1) * weight[:, None]
+    gram = basis @ basis.transpose(0, 2, 1)
     # The pipe's grey value goes on along it, to within its own stains: one row more holds each stretch's deviation.
-    basis = np.pad(basis, ((0, 0), (0, 1), (0, 0)))
-    basis[:, -1, 2] = pixels.evenness
-    turned = basis.transpose(0, 2, 1)
-    solver = np.linalg.inv(turned @ basis + 1e-9 * np.eye(3)) @ turned
-    wanted = np.pad((pixels.grey - (shading @ coefficients)[..., 0]) * pixels.weight, ((0, 0), (0, 1)))
-    level = (solver @ wanted[..., None])[..., 0]
-    residual = wanted - (basis @ level[..., None])[..., 0]
+    gram[:, 2, 2] += evenness**2
+    inverse = np.linalg.inv(gram + 1e-9 * np.eye(3))
+    wanted = (pixels.grey - (coefficients @ shading)[:, 0]) * weight
+    level = (inverse @ (basis @ wanted[..., None]))[..., 0]
+    residual = wanted - (level[:, None, :] @ basis)[:, 0]
     jump = (level[:, 2] - level[:, 0])[:, None]
     slope = level[:, 1][:, None]
-    by_tau = jump * bell / blur - slope * (1 - step) + (by_depth @ coefficients)[..., 0]
-    by_blur = -jump * bell * x + slope * bell * blur + (by_width @ coefficients)[..., 0]
-    jacobian = np.concatenate((np.stack((by_tau, -by_tau * pixels.along, by_blur), axis=2), shading), axis=2)
-    jacobian = np.pad(jacobian * pixels.weight[..., None], ((0, 0), (0, 1), (0, 0)))
-    jacobian = jacobian - basis @ (solver @ jacobian)
-    freedom = np.maximum(pixels.weight.sum(axis=1) - 4, 1)
-    squares = (residual**2).sum(axis=1)
+    by_tau = jump * bell / blur - slope * (1 - step) + (coefficients @ by_depth)[:, 0]
+    by_blur = -jump * bell * x + slope * bell * blur + (coefficients @ by_width)[:, 0]
+    jacobian = np.concatenate((np.stack((by_tau, -by_tau * pixels.along, by_blur), axis=1), shading), axis=1)
+    jacobian *= weight[:, None]
+    crossed = basis @ jacobian.transpose(0, 2, 1)
+    normal = jacobian @ jacobian.transpose(0, 2, 1) - crossed.transpose(0, 2, 1) @ (inverse @ crossed)
+    score = (jacobian @ residual[..., None])[..., 0]  # residuals are free of the levels: so need not be the derivatives
+    freedom = np.maximum(weight.sum(axis=1) - 4, 1)
+    squares = (residual**2).sum(axis=1) + (evenness * level[:, 2]) ** 2
     variance = np.maximum(squares / freedom, pixels.noise**2)
-    strength = np.maximum((jacobian[..., 0] ** 2).sum(axis=1), 1e-9)
-    shift = (jacobian[..., 0] * residual).sum(axis=1) / strength
-    return EdgeModel(jacobian, residual, shift, np.sqrt(variance / strength), squares, variance)
+    strength = np.maximum(normal[:, 0, 0], 1e-9)
+    return EdgeModel(normal, score, score[:, 0] / strength, np.sqrt(variance / strength), squares, variance)
 
 
 def _bell(x: Float) -> Float:
@@ -188,7 +200,8 @@ def _bell(x: Float) -> Float:
 def _shading(
     tau: Float, x: Float, step: Float, bell: Float, along: Float, blur: Float, half_width: Float
 ) -> tuple[Float, Float, Float]:
-    """What the shading inside may look like, blurred: terms, derivatives by depth and by log blur, (..., terms) each.
+    """What the shading inside may look like, blurred: terms, their derivatives by depth and by log blur, shape
+    (stretches, terms, n) each.
 
     The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
     shadow or a highlight begins, stand for the rest.
@@ -196,19 +209,19 @@ def _shading(
     Args:
         x: `tau / blur`, with its normal distribution `step` and density `bell`.
     """
-    terms, by_depth, by_width = (np.empty((*tau.shape, SHADING_TERMS)) for _ in range(3))
+    terms, by_depth, by_width = (np.empty((len(tau), SHADING_TERMS, tau.shape[1])) for _ in range(3))
     here = along / _TREND_PX
-    terms[..., 0], by_depth[..., 0], by_width[..., 0] = step, bell / blur, -bell * x
+    terms[:, 0], by_depth[:, 0], by_width[:, 0] = step, bell / blur, -bell * x
     for table in (terms, by_depth, by_width):
-        table[..., 1] = table[..., 0] * here
+        table[:, 1] = table[:, 0] * here
     scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
     root = scale * np.interp(x, _LIMB_X, _LIMB_Y)
     root_slope = scale * np.interp(x, _LIMB_X, _LIMB_SLOPE) / blur
-    terms[..., 2], by_depth[..., 2], by_width[..., 2] = root, root_slope, 0.5 * root - root_slope * tau
+    terms[:, 2], by_depth[:, 2], by_width[:, 2] = root, root_slope, 0.5 * root - root_slope * tau
     for i, start in enumerate(_KINKS_PX, 3):
         y = x - start / blur
         beyond, density = (step, bell) if start == 0.0 else (ndtr(y), _bell(y))
-        terms[..., i] = ((tau - start) * beyond + blur * density) / half_width
-        by_depth[..., i] = beyond / half_width
-        by_width[..., i] = blur * density / half_width
+        terms[:, i] = ((tau - start) * beyond + blur * density) / half_width
+        by_depth[:, i] = beyond / half_width
+        by_width[:, i] = blur * density / half_width
     return terms, by_depth, by_width

@@ -11,7 +11,7 @@ from ...factors.measurements import CameraName, OutlineSighting, Rejection
 from ..rays import ideal_grid
 from ..undistort import distort, undistort
 from .edges import EdgeLine, image_noise, straight_lines
-from .limb import EdgeFit, EdgeSeed, fit_edges
+from .limb import EdgeFit, EdgeSeed, confirmed_edges, fit_edges
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
 from .surface import occlusion_score, region_edges, region_score, sampled
 
@@ -56,7 +56,19 @@ class _Found:
     pair: EdgePair
     fits: tuple[EdgeFit, EdgeFit] | None
     """None where the sub-pixel fit failed; the hypothesis stays, as what might have been."""
+    seeds: tuple[EdgeSeed, EdgeSeed]
     score: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """The pixels about a place."""
+
+    grey: Float
+    """(n,)"""
+    px: Float
+    """(n, 2), ideal."""
+    noise: float
 
 
 class OutlineFinder:
@@ -105,9 +117,10 @@ class OutlineFinder:
         pairs.sort(key=lambda pair: -pair.score)
         if not pairs:
             return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
-        found = self._refined(pairs, grey.astype(float), self._ideal[rows, columns], prior, noise)
+        window = _Window(grey.astype(float).ravel(), self._ideal[rows, columns].reshape(-1, 2), noise)
+        found = self._refined(pairs, window, prior)
         found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
-        found = _outermost(sorted(found, key=lambda f: -f.score))
+        found = _confirmed(_outermost(sorted(found, key=lambda f: -f.score)), window)
         return self._decide(stamp_ns, pipe_id, found, prior)
 
     def _window(self, centre: Float) -> tuple[slice, slice]:
@@ -140,9 +153,7 @@ class OutlineFinder:
             return None
         return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
 
-    def _refined(
-        self, pairs: list[EdgePair], grey: Float, ideal: Float, prior: OutlinePrior, noise: float
-    ) -> list[_Found]:
+    def _refined(self, pairs: list[EdgePair], window: _Window, prior: OutlinePrior) -> list[_Found]:
         known = prior.half_width_px is not None
         pairs = pairs[: self._config.refined_known if known else self._config.refined_pairs]
         seeds: dict[tuple[int, bool], EdgeSeed] = {}
@@ -152,14 +163,14 @@ class OutlineFinder:
                 key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
                 keys.append(key)
                 seeds.setdefault(key, _seed(line, edge.span if key[1] else (-edge.span[1], -edge.span[0]), prior, pair))
-        fits = dict(zip(seeds, fit_edges(grey.ravel(), ideal.reshape(-1, 2), [*seeds.values()], noise), strict=True))
+        fits = dict(zip(seeds, fit_edges(window.grey, window.px, [*seeds.values()], window.noise), strict=True))
         found = []
         for pair, first, second in zip(pairs, keys[::2], keys[1::2], strict=True):
-            one, other = fits[first], fits[second]
+            one, other, both = fits[first], fits[second], (seeds[first], seeds[second])
             if one is None or other is None:
-                found.append(_Found(pair, None, pair.score - _NO_FIT))
+                found.append(_Found(pair, None, both, pair.score - _NO_FIT))
             else:
-                found.append(_Found(pair, (one, other), pair.score))
+                found.append(_Found(pair, (one, other), both, pair.score))
         blur = _sharp_blur(fits.values())
         return [
             f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
@@ -262,6 +273,19 @@ def _seed(line: Float, span: tuple[float, float], prior: OutlinePrior, pair: Edg
     """Where the sub-pixel fit of one edge begins."""
     foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
     return EdgeSeed(line, foot, (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0)), 0.5 * pair.width_px)
+
+
+def _confirmed(found: list[_Found], window: _Window) -> list[_Found]:
+    """The best hypothesis has its edges in a narrow window as well; one that has not is no fit."""
+    while found and found[0].fits is not None:
+        best = found[0]
+        assert best.fits is not None
+        one, other = confirmed_edges(window.grey, window.px, best.seeds, best.fits, window.noise)
+        if one is not None and other is not None:
+            return [replace(best, fits=(one, other)), *found[1:]]
+        without = replace(best, fits=None, score=best.score - _NO_FIT)
+        found = sorted([without, *found[1:]], key=lambda f: -f.score)
+    return found
 
 
 def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:

@@ -5,6 +5,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..median import median
+
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
@@ -103,8 +105,8 @@ def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, ha
     )
     variance = _flat(smooth).var(axis=1) + 0.5
     inside = _signed(lines, core_px, place, across)
-    pipe = float(np.median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)]))
-    wall = float(np.median(variance[inside < -2.0])) if (inside < -2.0).any() else pipe
+    pipe = median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)])
+    wall = median(variance[inside < -2.0]) if (inside < -2.0).any() else pipe
     if wall < 2.0 * pipe:
         return 0.0
     likeness = 0.5 * _INDEPENDENT * (np.log(wall / pipe) - variance * (1 / pipe - 1 / wall))
@@ -141,13 +143,13 @@ def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) 
     core = variance[(np.abs(place) <= 3.0) & known]
     if len(core) < 4:
         return []
-    pipe, found = float(np.median(core)), []
+    pipe, found = median(core), []
     for side in (-1.0, 1.0):
         order = np.nonzero(place == 0)[0][0] + (side * np.arange(1, reach + 1)).astype(int)
         order = order[known[order]]
         if len(order) < 12:
             continue
-        wall = float(np.median(variance[order[-10:]]))
+        wall = median(variance[order[-10:]])
         if wall < 2.0 * pipe:
             continue
         likeness = 0.5 * _INDEPENDENT * (np.log(wall / pipe) - variance[order] * (1 / pipe - 1 / wall))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .flow import inside
+from .images import Picture
 
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -35,13 +36,19 @@ class Patches:
     values: Float32
     """Shape (n, m), normalised."""
     gradient: Float32
-    """Shape (n, 2, m), weighted: derivative of the normalised values by the shift, times the samples' weights."""
+    """Shape (n, 2, m), weighted: derivative of the values, over the contrast, by the shift, times the samples'
+    weights."""
+    along: Float
+    """Shape (n, k): products of the derivatives with the values: a change of contrast, which is no motion."""
     inverse: Float
     """Shape (n, k, k), of the normal equations; k = 2 (shift) or 6 (shift and linear part)."""
     prior: Float
     """Shape (n, k, k): share of the step that pulls a bent warp back to the given one."""
     inverse_hessian: Float
     """Shape (n, 2, 2): covariance of the shift for unit variance of the raw difference, px^2 per grey value^2."""
+    bend: Float
+    """Shape (n, 2, 2): shift of the best fit, in the reference's pixels, by the curvature of the view (see
+    `warp.curvatures`)."""
     contrast: Float
     """Shape (n,), standard deviation of the patch in grey values."""
 
@@ -72,14 +79,16 @@ class Alignment:
     """Shape (n, 2, 2): of `px`, from the patch's structure and the residual, px^2, not yet calibrated."""
     converged: Bool
     """Shape (n,)."""
+    bend: Float
+    """Shape (n, 2, 2): linear part that fits beyond the given one, zero where only the shift is estimated."""
 
     def moved(self, offset: Float) -> "Alignment":
         """The same at places moved by `offset` (n, 2)."""
-        return Alignment(self.px + offset, self.correlation, self.covariance, self.converged)
+        return Alignment(self.px + offset, self.correlation, self.covariance, self.converged, self.bend)
 
     def take(self, index: NDArray[np.intp] | Bool) -> "Alignment":
         """Those at the given indices or of the given mask."""
-        return Alignment(self.px[index], self.correlation[index], self.covariance[index], self.converged[index])
+        return Alignment(*(getattr(self, field.name)[index] for field in fields(Alignment)))
 
 
 class PatchGrid:
@@ -99,32 +108,37 @@ class PatchGrid:
         weights = np.exp(-0.5 * (self.offsets**2).sum(axis=1) / (0.6 * (radius + 0.5) * spacing_px) ** 2)
         self.weights = (weights / weights.sum()).astype(np.float32)
         """Shape (m,). Sum to one; the middle counts more, so that a depth edge at the rim pulls less."""
-        self.moment_px2 = float((self.offsets[:, 0] ** 2) @ self.weights)
-        """Second moment of the weights along either axis."""
         self._stiffness = float((self.weights**2).sum()) / bend_sigma**2 if self.affine else 0.0
         self._basis = np.concatenate((np.ones((1, len(self.offsets))), self.offsets.T)).astype(np.float32)
         """Shape (3, m): one, and the offsets in u and v."""
         self._across = np.ascontiguousarray(self._basis[: 3 if self.affine else 1].T)
 
-    def sample(self, image: Float32, px: Float, linear: Float | None = None) -> Float32:
+    def sample(self, image: Picture, px: Float, linear: Float | None = None) -> Float32:
         """Grey values (n, m) at `px + linear @ offset`; `linear` (n, 2, 2) or None for the identity."""
         if linear is None:
             linear = np.broadcast_to(np.eye(2), (len(px), 2, 2))
         plane = np.concatenate((px[:, :, None], linear), axis=2).astype(np.float32)
         plane[~np.isfinite(px).all(axis=1)] = -10.0
+        plane *= image.density
         u, v = plane[:, 0] @ self._basis, plane[:, 1] @ self._basis
-        return _float32(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        return _float32(cv2.remap(image.values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
     def jacobian(self, gradient: Float32) -> Float32:
         """Derivatives (n, k, m) by shift and, where it is estimated, linear part (row by row), from (n, 2, m)."""
         if not self.affine:
-            return gradient
+            return gradient.copy()
         u, v = self._basis[1:]
         along_u, along_v = gradient[:, :1], gradient[:, 1:]
         return np.concatenate((gradient, along_u * u, along_u * v, along_v * u, along_v * v), axis=1)
 
+    def bent(self, gradient: Float32) -> Float32:
+        """Derivatives (n, 2, m) of the values by the two curvatures of the view, from those by the shift (n, 2, m)."""
+        u, v = self._basis[1:]
+        along = gradient[:, 0] * u + gradient[:, 1] * v
+        return np.stack((along * u, along * v), axis=1)
+
     def moment(self, weighted_gradient: Float32, difference: Float32) -> Float:
-        """`jacobian^T weights difference` (n, k) without forming the Jacobian."""
+        """`jacobian^T weights difference` (n, k) of centred differences without forming the Jacobian."""
         n, m = difference.shape
         product = (weighted_gradient * difference[:, None, :]).reshape(2 * n, m) @ self._across
         product = product.reshape(n, 2, -1).astype(np.float64)
@@ -152,10 +166,11 @@ def no_patches(grid: PatchGrid) -> Patches:
     k = 6 if grid.affine else 2
     square = np.zeros((0, k, k))
     values, gradient = np.zeros((0, m), np.float32), np.zeros((0, 2, m), np.float32)
-    return Patches(values, gradient, square, square, np.zeros((0, 2, 2)), np.zeros(0))
+    two = np.zeros((0, 2, 2))
+    return Patches(values, gradient, np.zeros((0, k)), square, square, two, two, np.zeros(0))
 
 
-def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
+def make_patches(image: Picture, px: Float, grid: PatchGrid, variance: float = 0.0) -> Patches:
     """Reference patches (n) about `px` (n, 2) of a smoothed image.
 
     `variance` is that expected between a patch and its reference, in squared grey values: it weighs the linear part's
@@ -170,10 +185,11 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0
         axis=1,
     )
     gradient /= deviation[:, None, None]
-    gradient -= (gradient @ grid.weights)[:, :, None]
-    along = (gradient @ (values * grid.weights)[:, :, None])[:, :, 0]
-    gradient -= along[:, :, None] * values[:, None, :]
     jacobian = grid.jacobian(gradient)
+    weighted = jacobian * grid.weights
+    along = (weighted @ values[:, :, None])[:, :, 0]
+    # What the normalisation takes out of the differences is taken out of their derivatives.
+    jacobian -= weighted.sum(axis=2)[:, :, None] + along[:, :, None] * values[:, None, :]
     weighted = jacobian * grid.weights
     hessian = (weighted @ jacobian.transpose(0, 2, 1)).astype(np.float64)
     variances = deviation.astype(np.float64) ** 2
@@ -181,12 +197,14 @@ def make_patches(image: Float32, px: Float, grid: PatchGrid, variance: float = 0
     inverse = np.linalg.inv(hessian + prior + 1e-9 * np.eye(hessian.shape[1]))
     squared = (weighted @ weighted.transpose(0, 2, 1)).astype(np.float64)
     spread = (inverse @ squared @ inverse)[:, :2, :2] / variances[:, None, None]
+    bend = inverse[:, :2] @ (weighted @ grid.bent(gradient).transpose(0, 2, 1)).astype(np.float64)
     gradient *= grid.weights
-    return Patches(values, gradient, inverse, inverse @ prior, spread, deviation.astype(np.float64))
+    along = along.astype(np.float64)
+    return Patches(values, gradient, along, inverse, inverse @ prior, spread, bend, deviation.astype(np.float64))
 
 
 def align(
-    image: Float32,
+    image: Picture,
     patches: Patches,
     guess: Float,
     linear: Float,
@@ -197,7 +215,7 @@ def align(
     """Places (n, 2) in a smoothed image where the reference patches fit best, near `guess` (n, 2).
 
     Args:
-        image: smoothed grey image (h, w).
+        image: smoothed grey image.
         patches: n reference patches.
         guess: start (n, 2); NaN gives no alignment.
         linear: (n, 2, 2), derivative of this image's pixels by the reference's.
@@ -209,6 +227,7 @@ def align(
     n = len(px)
     difference = np.zeros_like(patches.values)
     converged = np.zeros(n, dtype=bool)
+    bend = np.zeros((n, 2, 2))
     index = np.flatnonzero(np.isfinite(guess).all(axis=1))
     now = _Descent(patches, px, linear, grid) if len(index) == n else _Descent(patches, px, linear, grid).take(index)
     for _ in range(iterations):
@@ -216,6 +235,7 @@ def align(
             break
         difference[index] = now.step(image)
         px[index], converged[index] = now.px, now.still
+        bend[index] = now.linear
         # Those that are done go on with the rest until they are many: copies cost more than steps.
         if now.still.mean() > _DONE:
             index = index[~now.still]
@@ -228,7 +248,7 @@ def align(
     moved = np.linalg.norm(px - guess, axis=1)
     with np.errstate(invalid="ignore"):
         converged &= visible & (moved < reach_px)
-    return Alignment(px, correlation, covariance.astype(np.float64), converged)
+    return Alignment(px, correlation, covariance.astype(np.float64), converged, bend)
 
 
 class _Descent:
@@ -242,18 +262,24 @@ class _Descent:
         self.still = np.zeros(len(px), dtype=bool)
         """Which moved less than `_CONVERGED_PX` in the last step."""
 
+    @property
+    def linear(self) -> Float:
+        """Linear parts (n, 2, 2) that have been found."""
+        return self._bend[:, 2:].reshape(-1, 2, 2) if self._grid.affine else np.zeros((len(self.px), 2, 2))
+
     def take(self, chosen: NDArray[np.intp] | Bool) -> "_Descent":
         """Goes on with some of them."""
         part = _Descent(self._patches.take(chosen), self.px[chosen], self._linear[chosen], self._grid)
         part._bend, part._warp = self._bend[chosen], self._warp[chosen]
         return part
 
-    def step(self, image: Float32) -> Float32:
+    def step(self, image: Picture) -> Float32:
         """Moves all; the normalised differences (n, m) from before the step."""
         patches, grid = self._patches, self._grid
         difference = grid.normalise(grid.sample(image, self.px, self._warp))[0]
         difference -= patches.values
         moment = grid.moment(patches.gradient, difference)
+        moment -= patches.along * ((difference * patches.values) @ grid.weights)[:, None]
         move = (patches.inverse @ moment[:, :, None])[:, :, 0]
         if grid.affine:
             move += (patches.prior @ self._bend[:, :, None])[:, :, 0]

@@ -42,15 +42,22 @@ def flow(
 
 
 def checked_flow(
-    source: Image, target: Image, px: Float, guess: Float, window: int, levels: int, tolerance_px: float
+    source: Image,
+    target: Image,
+    px: Float,
+    guess: Float,
+    window: int,
+    levels: int,
+    tolerance_px: float,
+    first_levels: int = 1,
 ) -> tuple[Float, Bool]:
     """Flow forth and back: positions (n, 2) and which came back to their start.
 
-    The guess is mostly good to a few pixels: one coarse level does, and only those that fail there are looked for
-    again from the coarsest level. Where most fail, the guess itself was wrong (a sudden turn).
+    The guess is mostly good to a few pixels: `first_levels` coarse levels do, and only those that fail there are
+    looked for again from the coarsest level. Where most fail, the guess itself was wrong (a sudden turn).
     """
-    found, good = _there_and_back(source, target, px, guess, window, 1, tolerance_px)
-    if levels > 1 and not good.all():
+    found, good = _there_and_back(source, target, px, guess, window, first_levels, tolerance_px)
+    if levels > first_levels and not good.all():
         again = ~good
         found[again], good[again] = _there_and_back(
             source, target, px[again], guess[again], window, levels, tolerance_px
@@ -61,11 +68,13 @@ def checked_flow(
 def _there_and_back(
     source: Image, target: Image, px: Float, guess: Float, window: int, levels: int, tolerance_px: float
 ) -> tuple[Float, Bool]:
-    """The way back starts where the guessed flow leads back to, not at the answer."""
+    """The way back starts where the guessed flow leads back to, not at the answer; a smaller window does for it."""
     found, good = flow(source, target, px, guess, window, levels)
     good &= inside(found, target.shape, 1.0)
     if good.any():
         start = px[good] + found[good] - guess[good]
-        returned, came_back = flow(target, source, found[good], start, window, min(levels - 1, 1))
-        good[good] = came_back & (np.linalg.norm(returned - px[good], axis=1) < tolerance_px)
+        smaller = 2 * (3 * window // 8) + 1
+        returned, came_back = flow(target, source, found[good], start, smaller, min(levels, 1))
+        off = returned - px[good]
+        good[good] = came_back & (off[:, 0] ** 2 + off[:, 1] ** 2 < tolerance_px**2)
     return found, good

@@ -9,17 +9,17 @@ from ..undistort import distort, undistort
 from . import points
 from .detection import apart, detect
 from .flow import checked_flow, inside
-from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, project, transform
+from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
 from .keyframes import keyframe_reason
 from .landmarks import LandmarkStore
 from .motion import Motion, estimate_motion
 from .noise import NoiseModel
 from .observer import Keyview, Observer, expected_depth
 from .pair import StereoPair, prepare
-from .places import PlaceStore, Relocalisation
+from .places import ALIKE, PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
-from .sighting import Sighting, nothing_seen
+from .sighting import Sighting, blind_frame, nothing_seen
 from .tracks import Int, Tracks, no_tracks
 from .vertical import VerticalCorrection
 
@@ -27,6 +27,10 @@ Bool = NDArray[np.bool_]
 
 _FADING = 0.7
 """Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
+_STRAYED_ALIKE = 0.4
+"""Correlation of thumbnails from which on a place is worth a look after the tracks have broken."""
+_CALM_PX = 1.5
+"""Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
 
 class StereoFrontEnd:
@@ -60,6 +64,10 @@ class StereoFrontEnd:
         self._chain_T_keyframe = np.eye(4)
         self._keyframe_T_last = np.eye(4)
         self._velocity = np.zeros(6)
+        self._surprise_px = np.inf
+        """By how much the last flow differed from what constant velocity foretold."""
+        self._strayed_ns: int | None = None
+        """When the tracks broke without a known place having been found since."""
 
     @property
     def chain_T_keyframe(self) -> Float:
@@ -80,12 +88,13 @@ class StereoFrontEnd:
             return self._restart(pair, np.eye(4), lost=False)
         guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
         self._track(self._last, pair, guess)
-        motion = self._motion_of_flow(guess)
+        left_px = undistort(self.rig.left, self._tracks.raw_px)[0]
+        motion = self._motion_of_flow(left_px, guess)
         if motion is None:
             return self._recover(pair, guess)
         pose = motion.reference_T_this
-        if self._wants_keyframe(pose) is None:
-            return self._plain_frame(pair, motion)
+        if self._wants_keyframe(left_px, pose) is None:
+            return self._plain_frame(pair, left_px, motion)
         return self._keyframe(pair, pose) or self._recover(pair, pose)
 
     def relocalise(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> list[Relocalisation]:
@@ -132,15 +141,19 @@ class StereoFrontEnd:
     def _track(self, last: StereoPair, pair: StereoPair, guess: Float) -> None:
         """Flow from the last left image into this one; what does not come back ends."""
         tracks, settings = self._tracks, self.settings
+        expected = self._flow_guess(guess)
         found, good = checked_flow(
             last.left_as_bright_as(pair),
             pair.left,
             tracks.raw_px,
-            self._flow_guess(guess),
+            expected,
             settings.flow_window_px,
             settings.pyramid_levels,
             settings.forward_backward_px,
+            first_levels=int(self._surprise_px > _CALM_PX),
         )
+        surprise = np.abs(found - expected)[good]
+        self._surprise_px = median(surprise.max(axis=1)) if len(surprise) else np.inf
         tracks.raw_px = np.where(good[:, None], found, tracks.raw_px)
         self._end(~(good & inside(found, pair.left.shape, 3.0)))
 
@@ -157,12 +170,12 @@ class StereoFrontEnd:
         after = distort(camera, project(transform(inverse(guess), tracks.points), camera))
         shift = after - before
         known = np.isfinite(shift).all(axis=1)
-        shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
+        if not known.all():
+            shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
         return tracks.raw_px + np.clip(shift, -0.3 * self._diagonal, 0.3 * self._diagonal)
 
-    def _motion_of_flow(self, guess: Float) -> Motion | None:
+    def _motion_of_flow(self, left_px: Float, guess: Float) -> Motion | None:
         """Motion since the last keyframe from left pixels as the flow leaves them."""
-        left_px = undistort(self.rig.left, self._tracks.raw_px)[0]
         px = np.hstack((left_px, np.full_like(left_px, np.nan)))
         covariance = np.broadcast_to(self._noise.flow_variance * np.eye(4), (len(px), 4, 4))
         motion = self._robust_motion(px, covariance, guess)
@@ -196,11 +209,13 @@ class StereoFrontEnd:
 
     def _well_spread(self, px: Float) -> bool:
         """Inliers in one corner or on one line hold the pose badly."""
-        spread = np.sqrt(max(float(np.linalg.eigvalsh(np.cov(px.T))[0]), 0.0))
-        return spread > self.settings.min_spread * self._diagonal
+        u, v = (px - px.mean(axis=0)).T
+        uu, uv, vv = (float(product) / (len(px) - 1) for product in (u @ u, u @ v, v @ v))
+        least = 0.5 * (uu + vv) - float(np.hypot(0.5 * (uu - vv), uv))
+        return least > (self.settings.min_spread * self._diagonal) ** 2
 
-    def _wants_keyframe(self, pose: Float) -> str | None:
-        flow = undistort(self.rig.left, self._tracks.raw_px)[0] - self._tracks.keyframe_px
+    def _wants_keyframe(self, left_px: Float, pose: Float) -> str | None:
+        flow = left_px - self._tracks.keyframe_px
         flow = flow[np.isfinite(flow).all(axis=1)]
         return keyframe_reason(flow, pose, len(self._tracks), self._keyframe_count, self._diagonal, self.settings)
 
@@ -213,9 +228,8 @@ class StereoFrontEnd:
         self._last = pair
         return last_T_this
 
-    def _plain_frame(self, pair: StereoPair, motion: Motion) -> StereoFrame:
+    def _plain_frame(self, pair: StereoPair, left_px: Float, motion: Motion) -> StereoFrame:
         tracks = self._tracks
-        left_px = undistort(self.rig.left, tracks.raw_px)[0]
         n = len(tracks)
         frame = StereoFrame(
             stamp_ns=pair.stamp_ns,
@@ -312,8 +326,10 @@ class StereoFrontEnd:
         The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
         """
         nothing = no_tracks(self._observer.grid), nothing_seen()
-        before_ns = view.pair.stamp_ns - self.settings.loop_ns
-        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation)
+        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
+        if self._strayed_ns is not None:
+            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
+        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation, alike)
         if found is None:
             return nothing
         drifted = self._chain_T_keyframe
@@ -323,6 +339,7 @@ class StereoFrontEnd:
             self._chain_T_keyframe = drifted
             return nothing
         self._correct_chain(correction)
+        self._strayed_ns = None
         return tracks, seen
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
@@ -357,7 +374,10 @@ class StereoFrontEnd:
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
         found = self.places.find(pair.left, self.settings.min_relocalisation)
+        if not found and self._strayed_ns is None:
+            self._strayed_ns = self._last.stamp_ns if self._last is not None else None
         if found:
+            self._strayed_ns = None
             chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
             last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
         self._velocity = _FADING * self._velocity
@@ -373,21 +393,4 @@ class StereoFrontEnd:
         if np.isfinite(frame.right_px[:, 0]).sum() >= self.settings.min_inliers:
             return frame
         self._tracks = no_tracks(self._observer.grid)
-        return _blind(pair.stamp_ns, last_T_this)
-
-
-def _blind(stamp_ns: int, last_T_this: Float) -> StereoFrame:
-    """A frame that shows nothing."""
-    seen = nothing_seen()
-    return StereoFrame(
-        stamp_ns=stamp_ns,
-        is_keyframe=False,
-        track_ids=np.zeros(0, dtype=np.int64),
-        left_px=seen.left_px,
-        left_covariance_px2=seen.left_covariance,
-        right_px=seen.right_px,
-        right_covariance_px2=seen.right_covariance,
-        last_T_this=last_T_this,
-        motion_inliers=0,
-        lost=True,
-    )
+        return blind_frame(pair.stamp_ns, last_T_this)

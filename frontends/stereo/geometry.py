@@ -41,6 +41,16 @@ def rotation_angle(rotation: Float) -> float:
     return float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
 
 
+def median(values: Float) -> float:
+    """Median of finite numbers (n,), n > 0; NumPy's own takes ten times as long on a hundred."""
+    n = len(values)
+    half = n // 2
+    if n % 2:
+        return float(np.partition(values, half)[half])
+    middle = np.partition(values, (half - 1, half))
+    return float(0.5 * (middle[half - 1] + middle[half]))
+
+
 def rays(px: Float, camera: CameraModel) -> Float:
     """Directions (n, 3) with unit z through ideal pixels (n, 2)."""
     plane = np.ones((len(px), 3))
@@ -50,9 +60,9 @@ def rays(px: Float, camera: CameraModel) -> Float:
 
 
 def project(points: Float, camera: CameraModel) -> Float:
-    """Ideal pixels (n, 2) of points (n, 3); NaN behind the camera."""
-    z = np.where(points[:, 2] > 1e-6, points[:, 2], np.nan)
-    return points[:, :2] / z[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    """Ideal pixels (..., 2) of points (..., 3); NaN behind the camera."""
+    z = np.where(points[..., 2:] > 1e-6, points[..., 2:], np.nan)
+    return points[..., :2] / z * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def projection_jacobian(points: Float, camera: CameraModel) -> Float:

@@ -1,11 +1,16 @@
 """From camera images to comparable 8-bit grey ones: conversion, gain for dark views, brightness between frames."""
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
+
+_BINOMIAL_VARIANCE = 0.25
+"""Of the kernel (1, 4, 6, 4, 1) / 16 on half pixels, px^2."""
 
 
 def to_grey(image: NDArray[np.generic]) -> Image:
@@ -52,9 +57,33 @@ def brightness_table(levels_from: NDArray[np.float64], levels_to: NDArray[np.flo
     return np.clip(np.rint(table), 0, 255).astype(np.uint8)
 
 
-def smooth(image: Image, sigma_px: float) -> Float32:
+def smooth(image: Image | Float32, sigma_px: float) -> Float32:
     """Float image, low-passed; bilinear sampling of the raw image shifts by some hundredths of a pixel."""
     return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma_px), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A smoothed image with `density` samples per pixel along either axis; sample `density * i` is pixel i's centre."""
+
+    values: Float32
+    density: int = 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.values.shape[0] // self.density, self.values.shape[1] // self.density
+
+
+def dense(image: Image | Float32, sigma_px: float) -> Picture:
+    """Low-passed, with two samples per pixel.
+
+    Linear interpolation between pixels is itself a low-pass, half-way between them only: patches look sharper at whole
+    pixels, and all that move together are drawn there together. The binomial kernel of the pyramid (a cubic B-spline)
+    smooths alike at and between the pixels up to the fourth order, and leaves a quarter of the step to interpolate.
+    """
+    before = float(np.sqrt(max(sigma_px**2 - _BINOMIAL_VARIANCE, 0.04)))
+    return Picture(np.asarray(cv2.pyrUp(smooth(image, before)), dtype=np.float32), 2)
 
 
 def noise_sigma(image: Image, gain: float = 1.0) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .geometry import Float, rotation_angle
+from .geometry import Float, median, rotation_angle
 from .settings import StereoSettings
 
 
@@ -26,7 +26,7 @@ def keyframe_reason(
 
     A camera that stands still makes none, however few tracks it has: nothing new would come into view.
     """
-    moved = float(np.median(np.linalg.norm(flow_px, axis=1))) if len(flow_px) else np.inf
+    moved = median(np.hypot(flow_px[:, 0], flow_px[:, 1])) if len(flow_px) else np.inf
     if moved < settings.still_px:
         return None
     if moved > settings.keyframe_parallax * diagonal_px:

@@ -13,9 +13,9 @@ from ..undistort import distort
 from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
-from .images import Float32, smooth
+from .images import Float32, Picture, smooth
 from .tracks import CROP_SIDE, Int, Tracks
-from .warp import linear_warps, warp_offsets
+from .warp import bend_offsets, curvatures, linear_warps
 
 Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
@@ -27,7 +27,7 @@ _LARGEST_TURN = np.cos(np.deg2rad(35.0))
 _MISSES = 12
 
 
-def crops(image: Float32, raw_px: Float, grid: PatchGrid) -> Image:
+def crops(image: Picture, raw_px: Float, grid: PatchGrid) -> Image:
     """Surroundings (n, s, s) of places (n, 2) in a smoothed image."""
     side = round(len(grid.weights) ** 0.5)
     values = grid.sample(image, raw_px) if len(raw_px) else np.zeros((0, side * side))
@@ -65,6 +65,7 @@ class LandmarkStore:
         """In the chain's frame."""
         self.patch_points = np.zeros((0, 3))
         self.patch_poses = np.zeros((0, 4, 4))
+        self.slopes = np.zeros((0, 2))
         self.ages: Int = np.zeros(0, dtype=np.int64)
         self.misses: Int = np.zeros(0, dtype=np.int64)
         self.tiles: Image = np.zeros((0, CROP_SIDE, CROP_SIDE), dtype=np.uint8)
@@ -80,6 +81,7 @@ class LandmarkStore:
         self.points[rows] = transform(chain_T_keyframe, tracks.points[good])
         self.patch_points[rows] = tracks.patch_points[good]
         self.patch_poses[rows] = tracks.patch_poses[good]
+        self.slopes[rows] = tracks.slopes[good]
         self.ages[rows] = tracks.ages[good]
         self.misses[rows] = 0
         self.tiles[rows] = tracks.crops[good]
@@ -96,7 +98,7 @@ class LandmarkStore:
     def _grow(self, size: int) -> None:
         extra = size - len(self.ids)
         self.ids = np.concatenate((self.ids, np.full(extra, -1, dtype=np.int64)))
-        for name in ("points", "patch_points", "patch_poses", "ages", "misses", "tiles"):
+        for name in ("points", "patch_points", "patch_poses", "slopes", "ages", "misses", "tiles"):
             old = getattr(self, name)
             setattr(self, name, np.concatenate((old, np.zeros((extra, *old.shape[1:]), dtype=old.dtype))))
 
@@ -126,7 +128,7 @@ class LandmarkStore:
     def find_left(
         self,
         image: Image,
-        smoothed: Float32,
+        smoothed: Picture,
         candidates: Candidates,
         chain_T_this: Float,
         rig: StereoGeometry,
@@ -141,12 +143,14 @@ class LandmarkStore:
         rows = candidates.rows
         tiles, centres = _mosaic(self.tiles[rows])
         this_T_patch = inverse(chain_T_this) @ self.patch_poses[rows]
-        warp = linear_warps(self.patch_points[rows], this_T_patch, rig)[0]
-        off = warp_offsets(self.patch_points[rows], this_T_patch, rig, grid.moment_px2)[0]
+        surface = self.patch_points[rows], self.slopes[rows]
+        warp = linear_warps(*surface, this_T_patch, rig)[0]
         # Each tile is low-passed by itself: the mosaic's seams lie beyond the coarse patch.
-        coarse = make_patches(_low_pass(tiles), centres, _COARSE_GRID)
-        first = align(smooth(image, _COARSE_SMOOTHING_PX), coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
-        fine = make_patches(tiles, centres, grid, variance)
+        coarse = make_patches(Picture(_low_pass(tiles)), centres, _COARSE_GRID)
+        blurred = Picture(smooth(image, _COARSE_SMOOTHING_PX))
+        first = align(blurred, coarse, candidates.raw_px, warp, _COARSE_GRID, 12, 12.0)
+        fine = make_patches(Picture(tiles), centres, grid, variance)
+        off = bend_offsets(warp, fine.bend, curvatures(*surface, this_T_patch, rig)[0])
         start = np.where((first.correlation > 0.6)[:, None], first.px, np.nan)
         second = align(smoothed, fine, start, warp, grid, 10).moved(-off)
         return second, fine, second.converged & (second.correlation > min_correlation)
@@ -164,6 +168,7 @@ class LandmarkStore:
             patches=patches,
             patch_points=self.patch_points[rows].copy(),
             patch_poses=self.patch_poses[rows].copy(),
+            slopes=self.slopes[rows].copy(),
             crops=self.tiles[rows].copy(),
             ages=self.ages[rows] + 1,
             strikes=np.zeros(n, dtype=np.int64),

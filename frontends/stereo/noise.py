@@ -4,12 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alignment import Alignment, Patches
-from .geometry import Float
-from .motion import MEDIAN_2, MEDIAN_4
+from .geometry import Float, median
+from .left_motion import MEDIAN_2
+from .stereo_motion import MEDIAN_4
 
 Bool = NDArray[np.bool_]
 
-_FLOOR_PX = 0.06
+_FLOOR_PX = 0.04
 """What remains on sharp noise-free views: sampling and slant; scaled by the log's residuals like the rest."""
 _REFERENCE = 1.5
 _RATE = 0.4
@@ -93,4 +94,4 @@ def _median_ratio(chi2: Float, stereo: Bool) -> float:
     """Median of the squared residuals over that of their distribution; one where there are too few."""
     if len(chi2) < 20:
         return 1.0
-    return float(np.clip(np.median(chi2 / np.where(stereo, MEDIAN_4, MEDIAN_2)), 0.25, 4.0))
+    return min(max(median(chi2 / np.where(stereo, MEDIAN_4, MEDIAN_2)), 0.25), 4.0)

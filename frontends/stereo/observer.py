@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ..undistort import distort, undistort
 from .alignment import Alignment, Patches, PatchGrid, align, make_patches
 from .geometry import Float, StereoGeometry, inverse, project, rays, transform
-from .images import Float32
+from .images import Picture
 from .landmarks import CROP_GRID, crops
 from .matching import search_right
 from .noise import NoiseModel
@@ -16,9 +16,14 @@ from .pair import StereoPair
 from .settings import StereoSettings
 from .sighting import Sighting
 from .tracks import Int, Tracks, new_tracks
-from .warp import linear_warps, warp_offsets
+from .warp import bend_offsets, curvatures, linear_warps
 
 Bool = NDArray[np.bool_]
+
+_SLOPE_PARALLAX_PX = 4.0
+"""Parallax at which a patch's shear tells as much about its surface as one knows: most are less than 45 degrees off."""
+_STEEPEST = 0.02
+"""Largest slope, 1/px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +31,8 @@ class Keyview:
     """A keyframe's pair with its smoothed images."""
 
     pair: StereoPair
-    left: Float32
-    right: Float32
+    left: Picture
+    right: Picture
     noise: float
     """Standard deviation of the pixel noise, grey values."""
 
@@ -67,8 +72,9 @@ class Observer:
             the sighting, refined left raw pixels (n, 2), and which tracks were seen in the left image (n,).
         """
         this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
-        warps = linear_warps(tracks.patch_points, this_T_patch, self._rig)
-        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)
+        warps = linear_warps(tracks.patch_points, tracks.slopes, this_T_patch, self._rig)
+        curved = curvatures(tracks.patch_points, tracks.slopes, this_T_patch, self._rig)
+        off = [bend_offsets(*pair) for pair in zip(warps, [tracks.patches.bend] * 2, curved, strict=True)]
         left = align(view.left, tracks.patches, tracks.raw_px + off[0], warps[0], self.grid).moved(-off[0])
         left_px, left_covariance = self._left(left)
         seen = self.accepts(left) & np.isfinite(left_px).all(axis=1)
@@ -81,8 +87,10 @@ class Observer:
     def complete(self, view: Keyview, tracks: Tracks, chain_T_this: Float, left: Alignment) -> Sighting:
         """Observations of n tracks whose left patches have been aligned already, with their right matches."""
         this_T_patch = inverse(chain_T_this) @ tracks.patch_poses
-        warp = linear_warps(tracks.patch_points, this_T_patch, self._rig)[1]
-        off = warp_offsets(tracks.patch_points, this_T_patch, self._rig, self.grid.moment_px2)[1]
+        warp = linear_warps(tracks.patch_points, tracks.slopes, this_T_patch, self._rig)[1]
+        off = bend_offsets(
+            warp, tracks.patches.bend, curvatures(tracks.patch_points, tracks.slopes, this_T_patch, self._rig)[1]
+        )
         left_px, left_covariance = self._left(left)
         start = self._expected_right(left_px, tracks.points[:, 2])
         right = align(view.right, tracks.patches, start + off, warp, self.grid).moved(-off)
@@ -131,8 +139,21 @@ class Observer:
         good = np.isfinite(sighting.right_px[:, 0])
         ids: Int = np.arange(first_id, first_id + int(good.sum()), dtype=np.int64)
         surroundings = crops(view.left, raw_px[good], CROP_GRID)
-        tracks = new_tracks(ids, raw_px[good], ideal[good], patches.take(good), surroundings, chain_T_this)
+        slopes = self._slopes(ideal[good], right.take(good))
+        tracks = new_tracks(ids, raw_px[good], ideal[good], patches.take(good), slopes, surroundings, chain_T_this)
         return tracks, sighting.take(good)
+
+    def _slopes(self, ideal: Float, right: Alignment) -> Float:
+        """Slopes (n, 2) of surfaces, from how their patches are sheared in the right image.
+
+        There d lies at `far + e (1 + s . d)`, e the parallax of the patch's centre. What noise and prior of the linear
+        part leave over counts as a share of e.
+        """
+        far = project(rays(ideal, self._rig.left) @ self._rig.right_T_left[:3, :3].T, self._rig.right)
+        parallax = undistort(self._rig.right, right.px)[0] - far
+        square = (parallax**2).sum(axis=1, keepdims=True)
+        slopes = (parallax[:, None, :] @ right.bend)[:, 0] / (square + _SLOPE_PARALLAX_PX**2)
+        return np.clip(np.nan_to_num(slopes), -_STEEPEST, _STEEPEST)
 
     def _first_sighting(self, ideal: Float, raw_px: Float, right: Alignment, patches: Patches) -> Sighting:
         right_px, right_covariance = self._right(right)

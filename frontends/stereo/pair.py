@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import images
-from .images import Float32, Image
+from .images import Image, Picture
 
 Float = NDArray[np.float64]
 
@@ -28,9 +28,9 @@ class StereoPair:
         """Standard deviation of the pixel noise, grey values; takes half a millisecond, and keyframes alone need it."""
         return images.noise_sigma(self.left, self.gain)
 
-    def smooth(self, sigma_px: float) -> tuple[Float32, Float32]:
+    def smooth(self, sigma_px: float) -> tuple[Picture, Picture]:
         """Both images as floats, low-passed."""
-        return images.smooth(self.left, sigma_px), images.smooth(self.right, sigma_px)
+        return images.dense(self.left, sigma_px), images.dense(self.right, sigma_px)
 
     def left_as_bright_as(self, other: "StereoPair") -> Image:
         """The left image with the other pair's exposure."""

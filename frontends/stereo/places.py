@@ -17,7 +17,7 @@ from .motion import estimate_motion
 from .tracks import Int
 
 _TRIED = 8
-_ALIKE = 0.8
+ALIKE = 0.8
 """Correlation of thumbnails from which on a place is worth a look while nobody is lost."""
 _THUMBNAIL = (40, 30)
 
@@ -110,7 +110,7 @@ class PlaceStore:
                 found.append(match)
         return sorted(found, key=lambda match: -match.inliers)
 
-    def look_back(self, left: Image, before_ns: int, min_inliers: int) -> Relocalisation | None:
+    def look_back(self, left: Image, before_ns: int, min_inliers: int, alike: float = ALIKE) -> Relocalisation | None:
         """The one place of before that looks most like the left image, if it does and the features agree.
 
         Cheap where nothing looks alike: only thumbnails are compared then.
@@ -121,7 +121,7 @@ class PlaceStore:
         picture = _thumbnail(left).ravel()
         likeness = np.array([float(place.thumbnail.ravel() @ picture) for place in old])
         best = int(np.argmax(likeness))
-        if likeness[best] < _ALIKE:
+        if likeness[best] < alike:
             return None
         keypoints, descriptors = self._orb.detectAndCompute(left, None)
         if descriptors is None or len(keypoints) < min_inliers:

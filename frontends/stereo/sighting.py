@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...factors.measurements import StereoFrame
 from .geometry import Float, block_diagonal
 
 Bool = NDArray[np.bool_]
@@ -52,3 +53,20 @@ def nothing_seen() -> Sighting:
     """No feature."""
     none, no_covariance = np.zeros((0, 2)), np.zeros((0, 2, 2))
     return Sighting(none, no_covariance, none, no_covariance)
+
+
+def blind_frame(stamp_ns: int, last_T_this: Float) -> StereoFrame:
+    """A frame that shows nothing."""
+    seen = nothing_seen()
+    return StereoFrame(
+        stamp_ns=stamp_ns,
+        is_keyframe=False,
+        track_ids=np.zeros(0, dtype=np.int64),
+        left_px=seen.left_px,
+        left_covariance_px2=seen.left_covariance,
+        right_px=seen.right_px,
+        right_covariance_px2=seen.right_covariance,
+        last_T_this=last_T_this,
+        motion_inliers=0,
+        lost=True,
+    )

@@ -37,6 +37,8 @@ class Tracks:
     """Shape (n, 3): the point in the camera that saw the reference patch."""
     patch_poses: Float
     """Shape (n, 4, 4): that camera in the front end's own chain of motions."""
+    slopes: Float
+    """Shape (n, 2): of the surface there, relative change of the inverse depth per pixel of the reference patch."""
     crops: Image
     """Shape (n, s, s): the surroundings of the reference patch in its smoothed image, for a later return."""
     ages: Int
@@ -69,7 +71,9 @@ class Tracks:
 _ARRAYS = tuple(field.name for field in fields(Tracks) if field.name != "patches")
 
 
-def new_tracks(ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, crops: Image, pose: Float) -> Tracks:
+def new_tracks(
+    ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, slopes: Float, crops: Image, pose: Float
+) -> Tracks:
     """Tracks that begin at a keyframe with the given pose in the chain; without points yet."""
     n = len(ids)
     return Tracks(
@@ -82,6 +86,7 @@ def new_tracks(ids: Int, raw_px: Float, ideal_px: Float, patches: Patches, crops
         patches=patches,
         patch_points=np.full((n, 3), np.nan),
         patch_poses=np.broadcast_to(pose, (n, 4, 4)).copy(),
+        slopes=slopes,
         crops=crops,
         ages=np.ones(n, dtype=np.int64),
         strikes=np.zeros(n, dtype=np.int64),
@@ -92,4 +97,5 @@ def no_tracks(grid: PatchGrid) -> Tracks:
     """No track at all, for patches of the given grid."""
     none = np.zeros((0, 2))
     ids = np.zeros(0, dtype=np.int64)
-    return new_tracks(ids, none, none, no_patches(grid), np.zeros((0, CROP_SIDE, CROP_SIDE), np.uint8), np.eye(4))
+    crops = np.zeros((0, CROP_SIDE, CROP_SIDE), np.uint8)
+    return new_tracks(ids, none, none, no_patches(grid), none, crops, np.eye(4))

@@ -58,3 +58,8 @@ class Access:
         if self.token is None:
             return self.is_local
         return isinstance(given, str) and hmac.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+
+def cannot_listen(host: str, port: int, error: OSError) -> AccessError:
+    """What to raise when an address is in use or is none of this machine."""
+    return AccessError(f"{host}:{port}: cannot listen there ({error.strerror or error}); choose another port")

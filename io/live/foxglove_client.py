@@ -2,9 +2,7 @@
 
 import json
 import struct
-import threading
 import time
-from collections.abc import Mapping
 from typing import Any, cast
 from urllib.parse import urlsplit
 
@@ -17,7 +15,8 @@ from ..decode import ChannelInfo
 from .admission import Expected, Limits, plain_topic
 from .backoff import Backoff
 from .intake import Intake
-from .interfaces import Clock, Deliver
+from .interfaces import Clock
+from .threaded_source import CONNECT_S, ThreadedSource
 
 SUBPROTOCOLS = (Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1"))
 MESSAGE_DATA = 0x01
@@ -25,12 +24,11 @@ _DATA_HEADER = struct.Struct("<BIQ")
 _MAXIMUM_TEXT = 4 << 20
 _OVERHEAD = 64
 _LOOK_S = 0.2
-_CONNECT_S = 5.0
 VIOLATIONS = {1002: "malformed", 1007: "malformed", 1009: "oversized"}
 """Why this side ended a connection, by WebSocket's code: protocol error, no UTF-8, too large."""
 
 
-class FoxgloveClient:
+class FoxgloveClient(ThreadedSource):
     """A source that subscribes to the wanted topics as they are advertised, and connects again when it has to.
 
     Args:
@@ -48,73 +46,27 @@ class FoxgloveClient:
         if urlsplit(url).scheme not in ("ws", "wss") or not urlsplit(url).hostname:
             raise LogError(f"{url}: is no address of a Foxglove WebSocket server; give ws://HOST:PORT")
         self._url = url
-        self._intake = Intake(clock, expected, limits)
+        super().__init__("surecut-foxglove-client", Intake(clock, expected, limits))
         self._channels: dict[int, ChannelInfo] = {}
         """By subscription, whose number is the channel's own."""
-        self._stopping = threading.Event()
-        self._finished = threading.Event()
-        self._connected = False
-        self._status = "not started"
-        self._thread: threading.Thread | None = None
 
     @property
     def name(self) -> str:
         return f"Foxglove server {self._url}"
 
-    @property
-    def patient(self) -> bool:
-        return False
-
-    def start(self, deliver: Deliver) -> None:
-        self._intake.open(deliver)
-        self._thread = threading.Thread(target=self._run, name="surecut-foxglove-client", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopping.set()
-        self._intake.close()
-        if self._thread is not None:
-            self._thread.join(_CONNECT_S + 1)
-        self._finished.set()
-
-    def ended(self) -> bool:
-        return self._finished.is_set()
-
-    def connected(self) -> bool:
-        return self._connected
-
-    def status(self) -> str:
-        problem = self._intake.last_problem()
-        return f"{self.name}: {self._status}" + (f"; last problem: {problem}" if problem else "")
-
-    def counters(self) -> Mapping[str, int]:
-        return self._intake.counters()
-
-    def by_topic(self) -> Mapping[str, Mapping[str, int]]:
-        return self._intake.by_topic()
-
-    def _run(self) -> None:
-        backoff = Backoff()
-        while not self._stopping.is_set():
-            try:
-                with self._connect() as connection:
-                    self._connected, self._status = True, "connected"
-                    backoff.succeeded()
-                    self._read(connection)
-            except ConnectionClosed as error:
-                if error.sent is not None and not error.rcvd_then_sent and error.sent.code in VIOLATIONS:
-                    self._intake.refuse(VIOLATIONS[error.sent.code], None, str(error))
-                self._status = f"connection lost ({error})"
-            except (OSError, InvalidHandshake, InvalidURI, EOFError) as error:
-                self._status = f"cannot connect ({error})"
-            except Exception as error:  # whatever a stranger's server provokes must not end the source
-                self._intake.tally.add("errors")
-                self._status = f"{type(error).__name__}: {error}"
-            self._connected = False
-            if backoff.wait(self._stopping):
-                break
-            self._intake.tally.add("reconnects")
-        self._finished.set()
+    def _visit(self, backoff: Backoff) -> str:
+        try:
+            with self._connect() as connection:
+                self._opened()
+                backoff.succeeded()
+                self._read(connection)
+            return "the server ended the connection"
+        except ConnectionClosed as error:
+            if error.sent is not None and not error.rcvd_then_sent and error.sent.code in VIOLATIONS:
+                self._intake.refuse(VIOLATIONS[error.sent.code], None, str(error))
+            return f"connection lost ({error})"
+        except (OSError, InvalidHandshake, InvalidURI, EOFError) as error:
+            return f"cannot connect ({error})"
 
     def _connect(self) -> ClientConnection:
         self._channels.clear()
@@ -124,7 +76,7 @@ class FoxgloveClient:
             subprotocols=SUBPROTOCOLS,
             compression=None,  # nothing to unpack, so nothing that unpacks to more than the limit
             max_size=self._intake.limits.message_bytes + _OVERHEAD,
-            open_timeout=_CONNECT_S,
+            open_timeout=CONNECT_S,
             close_timeout=1.0,
             ping_interval=4.0,
             ping_timeout=6.0,

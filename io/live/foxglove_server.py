@@ -5,30 +5,25 @@ Speaks `foxglove.sdk.v1` and the older `foxglove.websocket.v1`. Commands arrive 
 """
 
 import asyncio
-import contextlib
 import logging
 import re
 import struct
-import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.typing import Origin
 
-from .access import Access, AccessError
-from .commands import CommandDesk
+from .access import Access
 from .foxglove_client import MESSAGE_DATA, SUBPROTOCOLS, VIOLATIONS
 from .foxglove_session import SERVICES, Session
 from .foxglove_views import View, description, image_views, views_of
-from .interfaces import LiveImage, LiveUpdate, OnCommand
-from .loop import LoopThread
-from .outbox import Outbox
-from .tally import Tally
+from .interfaces import LiveImage, LiveUpdate
+from .loop import Mailbox
+from .loop_server import LoopServer
 
 MAXIMUM_INBOUND = 64 << 10
-_CLOSE_S = 3.0
 _ORIGINS: tuple[Origin | re.Pattern[str] | None, ...] = (
     None,  # programs; browsers always name an origin
     Origin("https://app.foxglove.dev"),
@@ -39,7 +34,7 @@ _QUIET = logging.Logger("surecut.live", logging.CRITICAL + 1)
 """Strangers' failed handshakes are counted, not printed."""
 
 
-class FoxgloveServer:
+class FoxgloveServer(LoopServer[Server]):
     """A sink that any number of viewers (up to `maximum_clients`) may look at.
 
     Web pages of other origins than the viewers' cannot connect, so that a browser on this machine is no way in.
@@ -64,75 +59,26 @@ class FoxgloveServer:
         maximum_clients: int = 16,
         client_bytes: int = 8 << 20,
     ) -> None:
-        self._access = access or Access()
-        self._port = port
+        super().__init__("surecut-foxglove", access, port, images=True, maximum_clients=maximum_clients)
         self._origins = [*_ORIGINS, *(Origin(origin) for origin in origins)]
         self._picks_topic = picks_topic
-        self._maximum_clients = maximum_clients
         self._client_bytes = client_bytes
-        self._tally = Tally()
-        self._desk = CommandDesk(self._access, self._tally)
-        self._outbox = Outbox("surecut-foxglove", self._send, self._tally, images=True)
-        self._loop = LoopThread("surecut-foxglove-server")
-        self._server: Server | None = None
-        self._lock = threading.Lock()
         self._channels: dict[str, dict[str, Any]] = {}
         """By topic, as advertised."""
         self._sessions: dict[ServerConnection, Session] = {}
         self._open = 0
         """Connections, those that have not said anything yet included; of the loop's thread."""
-        self._gone_dropped = 0
-        """What sessions that ended had lost."""
 
     @property
     def name(self) -> str:
         return f"Foxglove server ws://{self._access.host}:{self._port}"
 
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self._port
+    def _waiting(self) -> list[Mailbox]:
+        return [session.mailbox for session in self._sessions.values()]
 
-    def start(self, on_command: OnCommand | None = None) -> None:
-        """
-        Raises:
-            AccessError: the address is in use or is none of this machine.
-        """
-        self._desk.open(on_command)
-        self._loop.start()
-        try:
-            self._server = self._loop.run(self._serve())
-        except OSError as error:
-            self._loop.stop()
-            reason = error.strerror or str(error)
-            raise AccessError(
-                f"{self._access.host}:{self._port}: cannot listen there ({reason}); choose another port"
-            ) from error
-        self._port = next(iter(self._server.sockets)).getsockname()[1]
-        self._outbox.start()
-
-    def publish(self, update: LiveUpdate) -> None:
-        self._outbox.publish(update)
-
-    def image(self, image: LiveImage) -> None:
-        self._outbox.image(image)
-
-    def stop(self) -> None:
-        self._outbox.stop()
-        server, self._server = self._server, None
-        if server is not None:
-            with contextlib.suppress(TimeoutError):  # whoever does not let go is left behind
-                self._loop.run(self._close(server), _CLOSE_S)
-        self._loop.stop()
-
-    def counters(self) -> Mapping[str, int]:
-        counters = dict(self._outbox.counters())
-        with self._lock:
-            lost = self._gone_dropped + sum(session.mailbox.dropped() for session in self._sessions.values())
-            counters["clients"] = len(self._sessions)
-        if lost:
-            counters["dropped"] = counters.get("dropped", 0) + lost
-        return counters
+    async def _listen(self) -> tuple[Server, int]:
+        server = await self._serve()
+        return server, next(iter(server.sockets)).getsockname()[1]
 
     async def _serve(self) -> Server:
         return await serve(
@@ -180,7 +126,7 @@ class FoxgloveServer:
 
         return Counted
 
-    async def _close(self, server: Server) -> None:
+    async def _end(self, server: Server) -> None:
         server.close()
         await server.wait_closed()
 

@@ -8,25 +8,21 @@ import asyncio
 import contextlib
 import json
 import socket
-import threading
-from collections.abc import Mapping
 
-from .access import Access, AccessError
-from .commands import MAXIMUM_COMMAND, CommandDesk
+from .access import Access
+from .commands import MAXIMUM_COMMAND
 from .descriptors import keep_alive
-from .interfaces import LiveImage, LiveUpdate, OnCommand
-from .loop import LoopThread, Mailbox
-from .outbox import Outbox
-from .tally import Tally
+from .interfaces import LiveImage, LiveUpdate
+from .loop import Mailbox
+from .loop_server import LoopServer
 from .views import json_object
 
 _SENDING = 64 << 10
-_CLOSE_S = 3.0
 _MAXIMUM_UNAUTHORISED = 5
 _MAXIMUM_MALFORMED = 100
 
 
-class JsonServer:
+class JsonServer(LoopServer[asyncio.Server]):
     """A sink; any number of clients up to `maximum_clients`.
 
     A client that does not keep up misses lines, the oldest first. A client that sends what is no command, such as a web
@@ -44,73 +40,22 @@ class JsonServer:
         maximum_clients: int = 16,
         client_bytes: int = 1 << 20,
     ) -> None:
-        self._access = access or Access()
-        self._port = port
-        self._maximum_clients = maximum_clients
+        super().__init__("surecut-json", access, port, images=False, maximum_clients=maximum_clients)
         self._client_bytes = client_bytes
-        self._tally = Tally()
-        self._desk = CommandDesk(self._access, self._tally)
-        self._outbox = Outbox("surecut-json", self._send, self._tally)
-        self._loop = LoopThread("surecut-json-server")
-        self._server: asyncio.Server | None = None
-        self._lock = threading.Lock()
         self._mailboxes: dict[asyncio.StreamWriter, Mailbox] = {}
-        self._gone_dropped = 0
 
     @property
     def name(self) -> str:
         return f"JSON lines tcp://{self._access.host}:{self._port}"
 
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return self._port
+    def _waiting(self) -> list[Mailbox]:
+        return list(self._mailboxes.values())
 
-    def start(self, on_command: OnCommand | None = None) -> None:
-        """
-        Raises:
-            AccessError: the address is in use or is none of this machine.
-        """
-        self._desk.open(on_command)
-        self._loop.start()
-        try:
-            self._server = self._loop.run(self._serve())
-        except OSError as error:
-            self._loop.stop()
-            reason = error.strerror or str(error)
-            raise AccessError(
-                f"{self._access.host}:{self._port}: cannot listen there ({reason}); choose another port"
-            ) from error
-        self._port = self._server.sockets[0].getsockname()[1]
-        self._outbox.start()
+    async def _listen(self) -> tuple[asyncio.Server, int]:
+        server = await asyncio.start_server(self._handle, self._access.host, self._port, limit=MAXIMUM_COMMAND + 1)
+        return server, server.sockets[0].getsockname()[1]
 
-    def publish(self, update: LiveUpdate) -> None:
-        self._outbox.publish(update)
-
-    def image(self, image: LiveImage) -> None:
-        """Images are not for this sink."""
-
-    def stop(self) -> None:
-        self._outbox.stop()
-        server, self._server = self._server, None
-        if server is not None:
-            with contextlib.suppress(TimeoutError):  # whoever does not let go is left behind
-                self._loop.run(self._close(server), _CLOSE_S)
-        self._loop.stop()
-
-    def counters(self) -> Mapping[str, int]:
-        counters = dict(self._outbox.counters())
-        with self._lock:
-            lost = self._gone_dropped + sum(mailbox.dropped() for mailbox in self._mailboxes.values())
-            counters["clients"] = len(self._mailboxes)
-        if lost:
-            counters["dropped"] = counters.get("dropped", 0) + lost
-        return counters
-
-    async def _serve(self) -> asyncio.Server:
-        return await asyncio.start_server(self._handle, self._access.host, self._port, limit=MAXIMUM_COMMAND + 1)
-
-    async def _close(self, server: asyncio.Server) -> None:
+    async def _end(self, server: asyncio.Server) -> None:
         server.close()
         with self._lock:
             writers = list(self._mailboxes)

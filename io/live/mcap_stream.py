@@ -1,6 +1,5 @@
 """MCAP as a stream, from standard input or a TCP server: needs nothing installed on the sender's side."""
 
-import threading
 import time
 from collections.abc import Mapping
 from typing import BinaryIO
@@ -16,13 +15,13 @@ from .admission import Expected, Limits
 from .backoff import Backoff
 from .descriptors import opened
 from .intake import Intake
-from .interfaces import Clock, Deliver
+from .interfaces import Clock
+from .threaded_source import CONNECT_S, ThreadedSource
 
 _MAXIMUM_SCHEMA = 1 << 20
-_CONNECT_S = 5.0
 
 
-class McapStream:
+class McapStream(ThreadedSource):
     """A source that reads one MCAP stream from its beginning; a lost connection is opened again.
 
     Senders should write without chunks, or flush after each message: a message arrives when its chunk is complete.
@@ -43,69 +42,22 @@ class McapStream:
     ) -> None:
         self._address = address
         self._target = tcp_target(address)
-        self._intake = Intake(clock, expected, limits)
-        self._patient = patient
-        self._stopping = threading.Event()
-        self._finished = threading.Event()
-        self._connected = False
-        self._status = "not started"
-        self._thread: threading.Thread | None = None
+        intake = Intake(clock, expected, limits)
+        super().__init__("surecut-mcap", intake, reopens=self._target is not None, patient=patient)
 
     @property
     def name(self) -> str:
         return "MCAP from standard input" if self._target is None else f"MCAP from {self._address}"
 
-    @property
-    def patient(self) -> bool:
-        return self._patient
-
-    def start(self, deliver: Deliver) -> None:
-        self._intake.open(deliver)
-        self._thread = threading.Thread(target=self._run, name="surecut-mcap", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stopping.set()
-        self._intake.close()
-        if self._thread is not None:
-            self._thread.join(_CONNECT_S + 1)
-        self._finished.set()
-
-    def ended(self) -> bool:
-        return self._finished.is_set()
-
-    def connected(self) -> bool:
-        return self._connected
-
-    def status(self) -> str:
-        problem = self._intake.last_problem()
-        return f"{self.name}: {self._status}" + (f"; last problem: {problem}" if problem else "")
-
-    def counters(self) -> Mapping[str, int]:
-        return self._intake.counters()
-
-    def by_topic(self) -> Mapping[str, Mapping[str, int]]:
-        return self._intake.by_topic()
-
-    def _run(self) -> None:
-        backoff = Backoff()
-        while not self._stopping.is_set():
-            try:
-                with opened(self._target, self._stopping, _CONNECT_S) as stream:
-                    self._connected, self._status = True, "connected"
-                    if self._read(stream):
-                        backoff.succeeded()
-                self._status = "the stream ended"
-            except (OSError, LogError) as error:
-                self._status = str(error)
-            except Exception as error:  # whatever a stranger's bytes provoke must not end the source
-                self._intake.tally.add("errors")
-                self._status = f"{type(error).__name__}: {error}"
-            self._connected = False
-            if self._target is None or backoff.wait(self._stopping):
-                break
-            self._intake.tally.add("reconnects")
-        self._finished.set()
+    def _visit(self, backoff: Backoff) -> str:
+        try:
+            with opened(self._target, self._stopping, CONNECT_S) as stream:
+                self._opened()
+                if self._read(stream):
+                    backoff.succeeded()
+            return "the stream ended"
+        except (OSError, LogError) as error:
+            return str(error)
 
     def _read(self, stream: BinaryIO) -> bool:
         """Read to the end; whether there was any record.

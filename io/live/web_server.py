@@ -15,7 +15,7 @@ from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.metrics_core import Metric
 
 from ..build_views import CHI_95_3D
-from .access import Access, AccessError
+from .access import Access, cannot_listen
 from .interfaces import Clock, HealthState, LiveImage, LivePoint, LiveUpdate, OnCommand
 from .tally import Tally
 from .views import health_object
@@ -77,10 +77,7 @@ class WebServer:
         try:
             self._server = _Server((self._access.host, self._port), self._maximum_requests, self._answer, self._tally)
         except OSError as error:
-            reason = error.strerror or str(error)
-            raise AccessError(
-                f"{self._access.host}:{self._port}: cannot listen there ({reason}); choose another port"
-            ) from error
+            raise cannot_listen(self._access.host, self._port, error) from error
         self._port = self._server.server_address[1]
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.1,), name="surecut-web", daemon=True)
         self._thread.start()

@@ -13,10 +13,11 @@ from rich.table import Table
 from ...estimator.executor import Executor, choose_executor
 from ...estimator.validated_range import range_text
 from ...factors.errors import SurecutError
-from ..campaign import open_campaign, run_campaign, write_whole
+from ..campaign import open_campaign, read_rows, run_campaign, write_whole
 from ..campaign_range import validated_range
 from ..campaign_real import real_table, real_tasks, real_text
 from ..campaign_report import label, quantity_text, report_html
+from ..campaign_row import Row
 from ..campaign_table import CampaignTable, tabulate, write_tables
 from ..campaign_validation import update_validation
 
@@ -46,6 +47,9 @@ def command(
         Path | None, typer.Option(help="Folder that keeps what `--level pixels` renders; what is there is used again.")
     ] = None,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
+    against: Annotated[
+        Path | None, typer.Option(help="Folder of another campaign with the same seeds, to compare the points with.")
+    ] = None,
     validation: Annotated[Path | None, typer.Option(help="Markdown page to put this campaign's table into.")] = None,
     range_file: Annotated[
         Path | None, typer.Option("--range", help="Write the validated range that reports ask for (YAML).")
@@ -61,20 +65,30 @@ def command(
         task = progress.add_task("runs", total=runs)
         executor = choose_executor(jobs, dask)
         rows = run_campaign(output, campaign, runs, executor, lambda count: progress.advance(task, count))
-    table = tabulate(rows)
+    table = tabulate(rows, _other(against, runs))
     notes = [f"Scenario {scenario}, level {level}.", when]
     write_tables(output, table, rows)
     write_whole(output / "report.html", report_html(f"Campaign {scenario}", table, rows, notes))
     _print(console, table)
     console.print(f"{output / 'report.html'}")
     if validation is not None:
-        name = f"{scenario}, decisions" if decisions else scenario
+        extras = {"decisions": decisions, "without families": leave_out, "sensitivity": sensitivity}
+        name = ", ".join([Path(scenario).stem, *(extra for extra, asked in extras.items() if asked)])
         update_validation(validation, name, level, table, when)
     if range_file is not None:
         write_whole(range_file, range_text(validated_range(rows, level, when)))
         console.print(f"{range_file}")
     if table.failed == table.runs:
         raise SurecutError(f"no run gave a result; the first says: {next(iter(table.reasons))}")
+
+
+def _other(folder: Path | None, runs: int) -> tuple[str, list[Row]] | None:
+    if folder is None:
+        return None
+    rows = read_rows(folder, range(runs))
+    if not rows:
+        raise SurecutError(f"{folder}: holds no runs of a campaign to compare with")
+    return ", ".join(dict.fromkeys(row["scenario"] for row in rows)), rows
 
 
 def stamp() -> str:

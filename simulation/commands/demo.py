@@ -12,6 +12,7 @@ from rich.table import Table
 from ...estimator.baseline import ChainPoint
 from ...estimator.commands.compare import true_points
 from ...estimator.compare import chain_of_messages
+from ...estimator.items import wanted_topics
 from ...estimator.optimise import optimise, rig_of
 from ...estimator.output_files import write_text
 from ...estimator.report.content import build_document
@@ -19,7 +20,6 @@ from ...estimator.report.html import render_html
 from ...estimator.result import Result
 from ...estimator.result_json import stored_sha256, to_json
 from ...estimator.result_log import write_result
-from ...estimator.sensing import wanted_topics
 from ...estimator.tables import result_tables
 from ...estimator.validated_range import load_validated_range
 from ...factors.rig import load_rig

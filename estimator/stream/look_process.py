@@ -1,4 +1,4 @@
-"""The front ends' process: groups of messages in; each frame's motion out at once, then what was seen to the graph."""
+"""The other front ends' process: markers, surfaces, clicks; what was seen at each stamp goes to the graph."""
 
 import time
 import traceback
@@ -16,30 +16,41 @@ from ...frontends.undistort import distort
 from ...io.live.interfaces import Outline
 from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
-from ..sensing import Item, Sensing, images
+from ..items import Item, unreadable
+from ..sensing import Sensing, images
 from ..sensors import PairImages
-from .parent import end_with_parent
+from .parent import LOOK_NICE, end_with_parent, give_way
 from .settings import StreamSettings
-from .wire import Died, Frame, Group, LateClick, Order, Ready, Worked
+from .thinning import Thinning
+from .wire import Died, LateClick, Order, Ready, Tracked, Worked
+
+REFUSALS = 1000
+"""Refused measurements that are kept with their words."""
 
 
-def sense(rig: Rig, settings: StreamSettings, inbox: Any, graph: Any, out: Any) -> None:
-    """The process. `inbox`, `graph` and `out` are queues between processes."""
+def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: Any, out: Any) -> None:
+    """The process. `inbox`, `graph` and `out` are queues between processes.
+
+    Args:
+        patient: the sources wait, so that no pose is late.
+    """
     end_with_parent()
+    if not patient:
+        give_way(LOOK_NICE)
     cv2.setNumThreads(1)
     try:
-        loop = SenseLoop(rig, settings, graph, out)
+        loop = LookLoop(rig, settings, patient, graph, out)
         out.put(Ready("front ends"))
         while True:
             item = inbox.get()
-            if isinstance(item, Group):
-                loop.take(item.items)
+            if isinstance(item, Tracked):
+                loop.take(item)
             elif isinstance(item, Order):
                 graph.put(item)
                 if item.what == "finish":
                     return
                 if item.what == "reset":
-                    loop = SenseLoop(rig, settings, graph, out, loop.calibrations)
+                    loop = LookLoop(rig, settings, patient, graph, out, loop.calibrations)
     except Exception:
         out.put(Died("front ends", traceback.format_exc()))
 
@@ -52,31 +63,39 @@ class Recent:
     frame: StereoFrame
 
 
-class SenseLoop:
-    """Works on one group after the other.
+class LookLoop:
+    """Looks at one group after the other.
 
     Args:
         calibrations: messages by topic that a fresh start has to be told again.
     """
 
     def __init__(
-        self, rig: Rig, settings: StreamSettings, graph: Any, out: Any, calibrations: dict[str, Message] | None = None
+        self,
+        rig: Rig,
+        settings: StreamSettings,
+        patient: bool,
+        graph: Any,
+        out: Any,
+        calibrations: dict[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
         self._settings = settings
         self._graph = graph
+        self._thinning = Thinning(graph, settings, patient)
         self._out = out
         self._recent: OrderedDict[int, Recent] = OrderedDict()
         self._newest_ns = 0
         self._pair: StereoPair | None = None
         self.calibrations: dict[str, Message] = {}
         for message in (calibrations or {}).values():
-            self.take([message])
+            self.take(Tracked([message], None))
 
-    def take(self, items: list[Item]) -> None:
+    def take(self, tracked: Tracked) -> None:
         """A group. Whatever is wrong with it is told, and the stream goes on."""
+        items = tracked.items
         began = time.process_time()
-        problem, outlines, picks = None, {}, 0
+        problem, bad, outlines, picks = None, (), {}, 0
         stamp_ns = items[0].stamp_ns
         try:
             clicks = [item for item in items if isinstance(item, Message) and _on_mobile(item)]
@@ -84,16 +103,19 @@ class SenseLoop:
                 picks = len(clicks)
                 self._late(clicks)
             else:
-                outlines = self._present(items)
+                outlines = self._present(items, tracked.frame)
         except SurecutError as error:
-            problem = " ".join(str(error).split())
-        self._out.put(Worked(outlines, stamp_ns, problem, picks, time.process_time() - began))
+            problem, bad = " ".join(str(error).split()), unreadable(items)
+        cpu_s = time.process_time() - began
+        thinned = self._thinning.taken()
+        self._out.put(Worked(outlines, stamp_ns, problem, picks, cpu_s, unreadable=bad, thinned=thinned))
 
-    def _present(self, items: list[Item]) -> dict[str, tuple[Outline, ...]]:
+    def _present(self, items: list[Item], frame: StereoFrame | None) -> dict[str, tuple[Outline, ...]]:
         self._note(items)
-        sensed = self._sensing.process(items, self._tracked)
+        sensed = self._sensing.look(items, frame)
         self._remember(sensed.bundle.frame)
-        self._graph.put(sensed)
+        self._thinning.put(sensed)
+        del self._sensing.sensors.rejected[:-REFUSALS]
         return self._outlines(sensed.bundle.sightings)
 
     def _note(self, items: list[Item]) -> None:
@@ -102,9 +124,6 @@ class SenseLoop:
                 self._pair = item
             elif self._sensing.is_calibration(item):
                 self.calibrations[item.topic] = item
-
-    def _tracked(self, frame: StereoFrame) -> None:
-        self._out.put(Frame(frame.stamp_ns, frame.last_T_this, frame.is_keyframe, frame.lost, frame.motion_inliers))
 
     def _remember(self, frame: StereoFrame | None) -> None:
         if frame is None or self._pair is None:

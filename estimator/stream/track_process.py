@@ -1,0 +1,97 @@
+"""The tracking's process: it does nothing that a pose has to wait for but the pose."""
+
+import queue
+import time
+import traceback
+from typing import Any
+
+import cv2
+
+from ...factors.errors import SurecutError
+from ...factors.rig import Rig
+from ...io.messages import CloudBody, DepthBody, ImageBody, Message
+from ...io.pairing import StereoPair
+from ..items import Item, unreadable
+from ..sensing import Sensing
+from .parent import end_with_parent
+from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
+
+
+def track(rig: Rig, patient: bool, inbox: Any, look: Any, out: Any) -> None:
+    """The process. `inbox`, `look` and `out` are queues between processes.
+
+    Args:
+        patient: nothing may be left out, however long it takes.
+    """
+    end_with_parent()
+    cv2.setNumThreads(1)
+    try:
+        loop = TrackLoop(rig, patient, look, out)
+        out.put(Ready("tracking"))
+        while True:
+            item = inbox.get()
+            if isinstance(item, Group):
+                loop.take(item.items)
+            elif isinstance(item, Order):
+                look.put(item)
+                if item.what == "finish":
+                    return
+                if item.what == "reset":
+                    loop = TrackLoop(rig, patient, look, out, loop.calibrations)
+    except Exception:
+        out.put(Died("tracking", traceback.format_exc()))
+
+
+class TrackLoop:
+    """Follows the mobile camera; hands everything on.
+
+    Args:
+        calibrations: messages by topic that a fresh start has to be told again.
+    """
+
+    def __init__(
+        self, rig: Rig, patient: bool, look: Any, out: Any, calibrations: dict[str, Message] | None = None
+    ) -> None:
+        self._sensing = Sensing(rig)
+        self._patient = patient
+        self._look = look
+        self._out = out
+        self.calibrations = calibrations or {}
+        self._sensing.calibrate([*self.calibrations.values()])
+
+    def take(self, items: list[Item]) -> None:
+        """A group. A pair that cannot be used is told, and the stream goes on."""
+        for item in items:
+            if self._sensing.is_calibration(item):
+                self.calibrations[item.topic] = item
+        taken_ns, began = time.monotonic_ns(), time.process_time()
+        frame, problem = None, None
+        try:
+            frame = self._sensing.follow(items)
+        except SurecutError as error:
+            problem = " ".join(str(error).split())
+        cpu_s = time.process_time() - began
+        if frame is not None:
+            motion = frame.last_T_this, frame.is_keyframe, frame.lost, frame.motion_inliers
+            self._out.put(Frame(frame.stamp_ns, *motion, taken_ns, time.monotonic_ns(), cpu_s))
+        elif problem is not None:
+            self._out.put(Worked({}, 0, problem, 0, cpu_s, unreadable=unreadable(items)))
+        if problem is not None:
+            items = [item for item in items if not isinstance(item, StereoPair)]  # it is told once
+        if items:
+            self._hand_on(Tracked(items, frame))
+
+    def _hand_on(self, tracked: Tracked) -> None:
+        """To the other front ends. Where these are far behind, what is only about surfaces is left out: the pose of
+        the camera must not wait for it."""
+        if not self._patient and all(_surfaces_only(item) for item in tracked.items):
+            try:
+                self._look.put_nowait(tracked)
+            except queue.Full:
+                self._out.put(Worked({}, 0, None, 0, 0.0, left_out=len(tracked.items)))
+            return
+        self._look.put(tracked)
+
+
+def _surfaces_only(item: Item) -> bool:
+    return not isinstance(item, StereoPair) and isinstance(item.body, ImageBody | DepthBody | CloudBody)
