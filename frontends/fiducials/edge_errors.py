@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 Float = NDArray[Any]
 Single = NDArray[Any]
 
-_TURN = np.float32(np.sqrt(6.0))
-"""A turn about the middle of a line, of half the mean square along it that a shift has: a line that errs as a whole has
-no turn, one that errs piece by piece as much of it as of a shift."""
+_TURN = np.float32(np.sqrt(3.0))
+"""A turn about the middle of a line, of a quarter of the mean square along it that a shift has: a line that errs as a
+whole has no turn, one that errs piece by piece as much of it as of a shift."""
 _LEAST_SHARE = 1e-3
 """Lines that are seen less than this share of the best one tell nothing."""
-_RANK = 1e-4
+_RANK = 1e-3
+"""Directions that the fit takes up to this share tell nothing."""
 _ROUNDING2 = 1.0 / 12.0
 
 
@@ -67,7 +68,7 @@ def edge_errors(
     over = np.where(D > _LEAST_SHARE * D.max(1, keepdims=True), 1.0 / np.maximum(D, 1e-12), 0.0)
     seen = over > 0
     S = S * seen[:, :, None] * seen[:, None, :]
-    noise = _noise(S, u * seen, D, over, residual, weight, columns.shape[-1])
+    noise = _noise(S, u * seen, over, residual, weight, columns.shape[-1])
     by_noise = np.einsum("mll,ml->m", S, over)
     by_lines = np.einsum("mlk,mlk,ml->m", S, S, over)
     off = ((u**2 * over).sum(1) - noise * by_noise) / noise
@@ -76,13 +77,14 @@ def edge_errors(
     return EdgeErrors(variance, noise, K @ K.transpose(0, 2, 1))
 
 
-def _noise(S: Float, u: Float, D: Float, over: Float, residual: Single, weight: Single, unknowns: int) -> Float:
+def _noise(S: Float, u: Float, over: Float, residual: Single, weight: Single, unknowns: int) -> Float:
     """Variance of a pixel once every line may be where it likes, shape (m,)."""
     root = np.sqrt(over)
-    values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
-    told = values > _RANK
-    along = np.einsum("mlk,ml->mk", vectors, u * root)
-    explained = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(1)
+    scaled = S * root[:, :, None] * root[:, None, :]
+    inverse = np.linalg.inv(scaled + _RANK * np.eye(S.shape[-1]))
+    along = u * root
+    explained = np.einsum("mk,mkl,ml->m", along, inverse, along)
+    told = np.einsum("mkl,mlk->m", scaled, inverse)
     left = (residual**2 * weight).sum(1) - explained
-    freedom = np.maximum(weight.sum(1) - unknowns - told.sum(1), 1.0)
+    freedom = np.maximum(weight.sum(1) - unknowns - told, 1.0)
     return np.maximum(left / freedom, _ROUNDING2)

@@ -7,7 +7,7 @@ Pixels, not interpolated samples, are compared, so the residuals are the noise a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -43,8 +43,9 @@ _TONE, _LIGHT, _UNKNOWNS = 11, 12, 22
 """Places among the unknowns: eight corner coordinates, three of the blur, the tone, ten of the light."""
 _TONE_RANGE = (-0.75, 3.0)
 """More bent than any camera; the same either way."""
-_COARSE_PX, _FINE_PX = 0.12, 0.04
-"""Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller."""
+_COARSE_PX, _FINE_PX, _WARM_PX = 0.12, 0.012, 0.03
+"""Corner steps at which the two stages stop; the last step is taken, so what remains is far smaller. Where blur and
+light are known from the last image the corners are there sooner: nothing else moves them any more."""
 _UNSETTLED = 0.15
 """What further steps would add to the last one, as a share of it: the most that was measured."""
 _COARSE_FORGIVEN_PX, _FORGIVEN_PX = 1.0, 0.15
@@ -73,9 +74,6 @@ class PatternFit:
     """Shape (m,), of the weight of the edges, what the robust fit has kept; small where the pattern is covered."""
     last_step_px: Float
     """Shape (m,), what the last step moved a corner by (part of the covariance); large where the fit did not settle."""
-    noise_factor: Float
-    """Shape (m,), how much the variance is raised over white noise of the same size, by residuals that hang together
-    and by such that gather where the corners are told."""
     structure: Float
     """Shape (m,), share of the covariance that is not the noise of the pixels but what the model does not know of
     print, lens and light: it comes back in the next image from the same place."""
@@ -106,14 +104,17 @@ def fit_patterns(
     D = np.stack([second_difference(p.tobytes(), len(p)) for p in patterns])
     lines = (np.arange(-1, cells + 2) / cells).astype(np.float32)
     raw = corners if raw is None else raw
-    near = corners
+    near, settled = corners, _WARM_PX
     if warm is None:
+        settled = _FINE_PX
         near, warm = _coarse(image, corners, raw, patterns, positions, D, lines)
         raw = raw + near - corners
     reach = _REACH_PX + _REACH_BLURS * np.sqrt(warm.blur[:, :2].max(1))
     pixels = choose_pixels(image, positions, raw, near, patterns, Choice(reach, _MAX_PIXELS))
     state = _State(near - pixels.origin[:, None], warm.blur, warm.tone, warm.light)
-    state, solved = _descend(state, pixels, D, lines, False)
+    state, groups = _descend(state, pixels, D, lines, settled)
+    order = np.argsort(np.concatenate([index for index, _ in groups]))
+    solved = _Settled.together([part for _, part in groups], order)
     size = image.shape[1], image.shape[0]
     return _summary(state, solved, pixels, pixel_noise(image, [surroundings(c, cells, size) for c in raw]))
 
@@ -132,7 +133,7 @@ def _coarse(
     pixels = choose_pixels(image, positions, raw, corners, patterns, Choice(np.full(m, _COARSE_REACH_PX), _FEW_PIXELS))
     blur = np.tile([_START_BLUR_PX**2, _START_BLUR_PX**2, 0.0], (m, 1))
     state = _State(corners - pixels.origin[:, None], blur, np.zeros(m), None)
-    state, _ = _descend(state, pixels, D, lines, True)
+    state, _ = _descend(state, pixels, D, lines, _COARSE_PX, True)
     assert state.light is not None
     return state.corners + pixels.origin[:, None], Warm(state.blur, state.tone, state.light)
 
@@ -180,33 +181,63 @@ class _Solved:
     weight: Single
     columns: Single
     """Jacobian by all unknowns, the corners first."""
-    shifts: tuple[Single, Single]
-    """Change of the grey values by the shift of each grid line."""
+    model: PatternModel
+    gain: Single
+    """Change of the grey values by the pattern."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Settled:
+    """The last step of markers whose corners have come to rest."""
+
+    step: Float
+    inverse: Float
+    residual: Single
+    weight: Single
+    columns: Single
+    shifts_a: Single
+    """Change of the grey values by a shift of each grid line of constant a, shape (m, n, k)."""
+    shifts_b: Single
     place: Single
-    """Of the pixels in the marker, from its middle."""
+    """Of the pixels in the marker, from its middle, shape (m, n, 2)."""
 
     @property
     def jacobian(self) -> Single:
         """By the corners."""
         return self.columns[..., :8]
 
+    @staticmethod
+    def of(solved: _Solved, which: NDArray[np.bool_]) -> "_Settled":
+        """Some of the markers."""
+        model, gain = solved.model, solved.gain[..., None]
+        of_a, of_b = model.by_lines()
+        place = np.stack([model.a - 0.5, model.b - 0.5], -1)
+        parts = (solved.step, solved.inverse, solved.residual, solved.weight, solved.columns)
+        parts = (*parts, gain * of_a, gain * of_b, place)
+        return _Settled(*(parts if which.all() else (part[which] for part in parts)))
 
-def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bool) -> tuple[_State, _Solved]:
-    """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for."""
-    m, n = pixels.value.shape
+    @staticmethod
+    def together(parts: Sequence["_Settled"], order: NDArray[np.int64]) -> "_Settled":
+        """All markers, in their own order."""
+        if len(parts) == 1:
+            return parts[0]
+        names = [field.name for field in fields(_Settled)]
+        return _Settled(*(np.concatenate([getattr(part, name) for part in parts])[order] for name in names))
+
+
+def _descend(
+    state: _State, pixels: Pixels, D: Single, lines: Single, settled_px: float, coarse: bool = False
+) -> tuple[_State, list[tuple[NDArray[np.int64], _Settled]]]:
+    """Gauss-Newton on each marker until none of its corners still moves by more than the stage asks for.
+
+    Returns:
+        The state, and the last steps, as groups of markers that came to rest together (empty where `coarse`).
+    """
+    m = len(pixels.value)
     corners, blur, tone = state.corners.copy(), state.blur.copy(), state.tone.copy()
     light = np.zeros((m, 10)) if state.light is None else state.light.copy()
-    solved = _Solved(
-        np.zeros((m, _UNKNOWNS)),
-        np.zeros((m, _UNKNOWNS, _UNKNOWNS)),
-        np.zeros((m, n), np.float32),
-        np.zeros((m, n), np.float32),
-        np.zeros((m, n, _UNKNOWNS), np.float32),
-        (np.zeros((m, n, len(lines)), np.float32), np.zeros((m, n, len(lines)), np.float32)),
-        np.zeros((m, n, 2), np.float32),
-    )
     forgiven = _COARSE_FORGIVEN_PX if coarse else _FORGIVEN_PX
-    active = np.arange(m)
+    active, settled = np.arange(m), []
     for count in range(_STEPS):
         lit = None if count == 0 and state.light is None else light[active]
         now = _State(corners[active], blur[active], tone[active], lit)
@@ -217,14 +248,13 @@ def _descend(state: _State, pixels: Pixels, D: Single, lines: Single, coarse: bo
         blur[active] = _bounded(blur[active], one.step[:, 8:11], _COARSE_BLUR_PX if coarse else _BLUR_RANGE_PX[0])
         tone[active] = np.clip(tone[active] + one.step[:, _TONE], *_TONE_RANGE)
         light[active] = one.step[:, _LIGHT:]
-        for name in ("step", "inverse", "residual", "weight", "columns", "place"):
-            getattr(solved, name)[active] = getattr(one, name)
-        for all_shifts, shifts in zip(solved.shifts, one.shifts, strict=True):
-            all_shifts[active] = shifts
-        active = active[largest > (_COARSE_PX if coarse else _FINE_PX)]
+        rests = (largest <= settled_px) | (count == _STEPS - 1) | ~np.isfinite(largest)
+        if rests.any() and not coarse:
+            settled.append((active[rests], _Settled.of(one, rests)))
+        active = active[~rests]
         if not len(active):
             break
-    return _State(corners, blur, tone, light), solved
+    return _State(corners, blur, tone, light), settled
 
 
 def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px: float, tone_fixed: bool) -> _Solved:
@@ -261,8 +291,7 @@ def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px:
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
     step[:, _LIGHT:] += light
-    shifts = gain[..., None] * model.by_lines[0], gain[..., None] * model.by_lines[1]
-    return _Solved(step, inverse, after, weight, columns, shifts, np.stack([u, v], -1))
+    return _Solved(step, inverse, after, weight, columns, model, gain)
 
 
 def _by_corners(H: Float, model: PatternModel, xy: Single, gain: Single) -> Single:
@@ -324,14 +353,15 @@ def _correlation(value: Single, residual: Single, weight: Single) -> Float:
     return np.sqrt(np.clip(1.0 - left / np.maximum(spread, 1e-9), 0.0, 1.0)).astype(float)
 
 
-def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> PatternFit:
+def _summary(state: _State, solved: _Settled, pixels: Pixels, noise: Float) -> PatternFit:
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
-    edges = edge_errors(solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place)
-    factor = _hang_together(solved, pixels, weight) * _gathered(solved, weight, variance)
+    edges = edge_errors(
+        solved.columns, solved.inverse, solved.residual, weight, (solved.shifts_a, solved.shifts_b), solved.place
+    )
     last_step = np.abs(solved.step[:, :8]).max(1)
-    by_noise = solved.inverse[:, :8, :8] * (edges.noise_variance * factor)[:, None, None]
+    by_noise = solved.inverse[:, :8, :8] * edges.noise_variance[:, None, None]
     covariance = by_noise + edges.variance_px2 * edges.spread
     covariance += ((_UNSETTLED * last_step) ** 2)[:, None, None] * np.eye(8)
     return PatternFit(
@@ -343,50 +373,18 @@ def _summary(state: _State, solved: _Solved, pixels: Pixels, noise: Float) -> Pa
         _correlation(pixels.value, solved.residual, weight),
         _share(solved, pixels),
         last_step,
-        factor,
-        _structure(solved, covariance, np.minimum(noise**2 + _ROUNDING**2, edges.noise_variance * factor)),
+        _structure(solved, covariance, np.minimum(noise**2 + _ROUNDING**2, edges.noise_variance)),
         Warm(state.blur, state.tone, light),
     )
 
 
-def _structure(solved: _Solved, covariance: Float, noise: Float) -> Float:
+def _structure(solved: _Settled, covariance: Float, noise: Float) -> Float:
     """Share of the covariances that is not the noise of the pixels (a variance, shape (m,))."""
     by_noise = noise * np.einsum("mkk->m", solved.inverse[:, :8, :8])
     return np.clip(1.0 - by_noise / np.einsum("mkk->m", covariance), 0.0, 1.0)
 
 
-def _share(solved: _Solved, pixels: Pixels) -> Float:
+def _share(solved: _Settled, pixels: Pixels) -> Float:
     strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian)
     whole = (strength * pixels.weight).sum(1)
     return ((strength * solved.weight).sum(1) / np.maximum(whole, 1e-9)).astype(float)
-
-
-def _gathered(solved: _Solved, weight: Single, variance: Float) -> Float:
-    """How much larger residuals are where they tell of the corners than elsewhere, shape (m,), as a variance; 1 where
-    they are not.
-
-    A picture that was made smaller without care has steps along its edges and noise nowhere else (White, "A
-    heteroskedasticity-consistent covariance matrix estimator", 1980).
-    """
-    strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian) * weight**2
-    there = (solved.residual**2 * strength).sum(1).astype(float)
-    return np.maximum(there / np.maximum(variance * strength.sum(1), 1e-12), 1.0)
-
-
-def _hang_together(solved: _Solved, pixels: Pixels, weight: Single) -> Float:
-    """Variance of the sums of residuals over small blocks against that of independent ones, shape (m,).
-
-    1 where it is no larger than chance makes it.
-    """
-    m = len(weight)
-    blocks = int(pixels.block.max(initial=0)) + 1
-    place = (pixels.block + blocks * np.arange(m)[:, None]) * 8
-    score = ((solved.residual * weight)[..., None] * solved.jacobian).astype(float)
-    apart = (score**2).sum((1, 2))
-    sums = np.bincount((place[..., None] + np.arange(8)).ravel(), score.ravel(), minlength=m * blocks * 8)
-    sums = sums.reshape(m, blocks, 8) ** 2
-    each = sums.sum(1)
-    together = each.sum(1)
-    used = (each**2 / np.maximum((sums**2).sum(1), 1e-12)).max(1)
-    factor = together / np.maximum(apart, 1e-12)
-    return np.where(factor > 1.0 + 2.0 * np.sqrt(2.0 / np.maximum(used, 1.0)), factor, 1.0)

@@ -84,8 +84,17 @@ class PatternModel:
     """By the blur's variances xx, yy and covariance xy in the image, shape (m, n, 3)."""
     surround: Single
     """How much of what each pixel sees lies more than a cell outside: left, right, below, above; shape (m, n, 4)."""
-    by_lines: tuple[Single, Single]
-    """By a shift of each grid line across itself, in pixels: of those of constant a, then of b; shapes (m, n, k)."""
+    slopes: tuple[Single, Single]
+    """Across the grid lines of constant a, and of b, what the pattern changes by there; shapes (m, n, k)."""
+    crossed: tuple[Single, Single]
+    """What the other coordinate's lines make of each of them; shapes (m, n, k)."""
+    across: tuple[Single, Single]
+    """By a shift of one pixel; shapes (m, n)."""
+
+    def by_lines(self) -> tuple[Single, Single]:
+        """By a shift of each grid line across itself, in pixels: of those of constant a, then of b; (m, n, k) each."""
+        of_a, of_b = (s * c * x[..., None] for s, c, x in zip(self.slopes, self.crossed, self.across, strict=True))
+        return of_a, of_b
 
 
 def pattern_model(H: Float, xy: Single, blur: Float, D: Single, lines: Single) -> PatternModel:
@@ -98,7 +107,7 @@ def pattern_model(H: Float, xy: Single, blur: Float, D: Single, lines: Single) -
     ta, fa, na = _steps(a, lines, over_a)
     tb, fb, nb = _steps(b, lines, over_b)
     nta, ntb = na * ta, nb * tb
-    fa_D, na_D, nta_D = fa @ D, na @ D, nta @ D
+    fa_D, na_D, nta_D, fb_D = fa @ D, na @ D, nta @ D, fb @ D.transpose(0, 2, 1)
     both = _dot(na_D, nb)
     T = 1.0 + _dot(fa_D, fb) + skew * both + (0.5 * skew * skew) * _dot(nta_D, ntb)
     by_a = (_dot(na_D, fb) - skew * _dot(nta_D, nb)) * over_a
@@ -112,8 +121,7 @@ def pattern_model(H: Float, xy: Single, blur: Float, D: Single, lines: Single) -
     by_blur[..., 2] = aa * x_a * y_a + bb * x_b * y_b + ab * (x_a * y_b + x_b * y_a)
     surround = np.stack([1.0 - fa[..., 0], fa[..., -1], 1.0 - fb[..., 0], fb[..., -1]], -1)
     across = -over_a * _length(grad_a), -over_b * _length(grad_b)
-    by_lines = na * (fb @ D.transpose(0, 2, 1)) * across[0][..., None], nb * fa_D * across[1][..., None]
-    return PatternModel(a, b, T, gradient, by_blur, surround, by_lines)
+    return PatternModel(a, b, T, gradient, by_blur, surround, (na, nb), (fb_D, fa_D), across)
 
 
 def _length(vectors: Single) -> Single:

@@ -21,8 +21,6 @@ _MARGIN_CELLS = 0.9
 _SPARE = 2.0
 """Places per wanted pixel: some fall on the same one."""
 _GOLDEN = 0.6180339887498949
-_BLOCK_PX, _BLOCK_PIXELS = 3, 8
-"""Least size of the blocks in which residuals are tested for hanging together, and chosen pixels in each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,13 +32,11 @@ class Pixels:
     xy: Single
     value: Single
     weight: Single
-    block: NDArray[np.int64]
-    """Which small block of the image a pixel is in, from 0 in each marker."""
 
     def of(self, which: NDArray[np.int64]) -> "Pixels":
         if len(which) == len(self.value):
             return self
-        return Pixels(self.origin[which], self.xy[which], self.value[which], self.weight[which], self.block[which])
+        return Pixels(self.origin[which], self.xy[which], self.value[which], self.weight[which])
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +69,10 @@ def choose_pixels(
     chosen = _distinct(_near_edges(raw, patterns, choice), image.shape, choice.most)
     m, n = len(corners), max((len(c) for c in chosen), default=0)
     index, weight = np.zeros((m, n), np.int64), np.zeros((m, n), np.float32)
-    block = np.zeros((m, n), np.int64)
     for k, mine in enumerate(chosen):
         count = len(mine)
         if count:
             index[k, :count], index[k, count:], weight[k, :count] = mine, mine[0], 1.0
-            block[k, :count] = _blocks(mine, width)
     flat = index.ravel()
     value = image.reshape(-1)[flat].astype(np.float32).reshape(m, n)
     if positions is None:
@@ -86,17 +80,7 @@ def choose_pixels(
         xy = np.stack([index - rows * width, rows], -1)
     else:
         xy = positions.reshape(-1, 2)[flat].reshape(m, n, 2)
-    return Pixels(origin, (xy - origin[:, None]).astype(np.float32), value, weight, block)
-
-
-def _blocks(index: NDArray[np.int64], width: int) -> NDArray[np.int64]:
-    """Which of the squares that hold some pixels each the pixels of one marker (flat indices, in order) are in."""
-    rows = index // width
-    columns = index - rows * width
-    x0, y0 = int(columns.min()), int(rows[0])
-    x1, y1 = int(columns.max()) + 1, int(rows[-1]) + 1
-    size = max(_BLOCK_PX, int(np.sqrt((x1 - x0) * (y1 - y0) * _BLOCK_PIXELS / len(index))))
-    return (rows - y0) // size * ((x1 - x0) // size + 1) + (columns - x0) // size
+    return Pixels(origin, (xy - origin[:, None]).astype(np.float32), value, weight)
 
 
 def _near_edges(raw: Float, patterns: list[Float], choice: Choice) -> Float:
