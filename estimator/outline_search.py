@@ -25,8 +25,8 @@ OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
 OUTLINE_PRIOR = (0.006, 0.02, 0.004)
 """Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for. The radius's is
-measured, not derived: half, three quarters and one pixel at the pipe's range, with what its finish hides, each let edges
-within one pipe of twenty rendered recordings take its outline's place, see docs/kinect.md."""
+measured, not derived: with half, three quarters and one pixel at the pipe's range edges within the pipe took its
+outline's place in one of twenty rendered recordings, see docs/kinect.md."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
 
