@@ -78,7 +78,6 @@ def started(log: Path, memory: Path, record: Path, port: int) -> subprocess.Pope
         [sys.executable, "-c", script, "stream", *map(str, options)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=True,
     )
 
 
@@ -164,10 +163,12 @@ def kills(log: Path, number: int, seed: int) -> list[Kill]:
         for i in range(number + 1):
             port, record = free_port(), Path(folder) / f"{i}.mcap"
             process = started(log, memory, record, port)
-            life = lived(port, memory, truth, draw.uniform(0.0, 8.0), before)
+            try:
+                life = lived(port, memory, truth, draw.uniform(0.0, 8.0), before)
+            finally:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
             before = life.points
-            process.send_signal(signal.SIGKILL)
-            process.wait()
             if not i:
                 continue
             lost_s = max(life.newest_ns - recorded_until_ns(record), 0) * 1e-9

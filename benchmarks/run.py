@@ -57,15 +57,17 @@ class Row:
         return self.ours_s / self.plain_s
 
 
-def timed(call: Callable[[], object], repeat: int = 5) -> float:
-    """Median seconds, after one call that warms up."""
+def compared(name: str, ours: Callable[[], object], plain: str, call: Callable[[], object], repeat: int = 5) -> Row:
+    """Median seconds of both, by turns, after one call each: what else the machine does meets both alike."""
+    ours()
     call()
-    seconds = []
+    seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(repeat):
-        begin = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - begin)
-    return statistics.median(seconds)
+        for one, taken in zip((ours, call), seconds, strict=True):
+            begin = time.perf_counter()
+            one()
+            taken.append(time.perf_counter() - begin)
+    return Row(name, statistics.median(seconds[0]), plain, statistics.median(seconds[1]))
 
 
 def camera(name: str, baseline_m: float | None = None) -> CameraModel:
@@ -85,8 +87,8 @@ def markers(run: Run) -> Row:
     settings = cv2.aruco.DetectorParameters()
     settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, settings)
-    ours = timed(lambda: front_end.process(0, image))
-    return Row("markers, 640x480", ours, "OpenCV's detector", timed(lambda: detector.detectMarkers(image)))
+    name, plain = "markers, 640x480", "OpenCV's detector"
+    return compared(name, lambda: front_end.process(0, image), plain, lambda: detector.detectMarkers(image))
 
 
 def odometry() -> Row:
@@ -115,7 +117,7 @@ def odometry() -> Row:
         for image in (right, following):
             cv2.calcOpticalFlowPyrLK(left, image, corners, np.zeros_like(corners))
 
-    return Row("stereo odometry, 640x480", timed(ours, 20), "OpenCV's corners and flow", timed(plain, 20))
+    return compared("stereo odometry, 640x480", ours, "OpenCV's corners and flow", plain, 20)
 
 
 def cloud() -> Row:
@@ -132,9 +134,12 @@ def cloud() -> Row:
     config.mapping.voxel_size = 0.05
     config.data.max_range, config.data.min_range = 5.0, 0.3
     kiss = KissICP(config)
-    ours = timed(lambda: front_end.process(0, depth_m, 10))
-    plain = timed(lambda: kiss.register_frame(points, np.zeros(0)))
-    return Row("Kinect surfaces, 640x480", ours, "KISS-ICP, 5 cm voxels", plain)
+    return compared(
+        "Kinect surfaces, 640x480",
+        lambda: front_end.process(0, depth_m, 10),
+        "KISS-ICP, 5 cm voxels",
+        lambda: kiss.register_frame(points, np.zeros(0)),
+    )
 
 
 def graph(run: Run) -> list[Row]:
@@ -158,21 +163,17 @@ def graph(run: Run) -> list[Row]:
     def marginals() -> object:
         return gtsam.Marginals(factors, values).jointMarginalCovariance(gtsam.KeyVector(wanted)).fullMatrix()
 
-    plain_lm = timed(lm, 3)
+    def joint() -> object:
+        return LinearSystem(factors, values).joint(wanted)
+
+    def offline() -> object:
+        return estimate(run.measurements, run.rig, run.cameras, lay_on_surfaces)
+
+    one_lm = "one LM over the same graph"
     return [
-        Row("iSAM2, keyframe by keyframe", timed(stream, 2), "one LM over the same graph", plain_lm),
-        Row(
-            "joint covariance",
-            timed(lambda: LinearSystem(factors, values).joint(wanted), 3),
-            "gtsam's Marginals",
-            timed(marginals, 3),
-        ),
-        Row(
-            "offline run from measurements",
-            timed(lambda: estimate(run.measurements, run.rig, run.cameras, lay_on_surfaces), 2),
-            "one LM over the same graph",
-            plain_lm,
-        ),
+        compared("iSAM2, keyframe by keyframe", stream, one_lm, lm, 3),
+        compared("joint covariance", joint, "gtsam's Marginals", marginals, 3),
+        compared("offline run from measurements", offline, one_lm, lm, 3),
     ]
 
 

@@ -78,8 +78,12 @@ def soak(log: Path, minutes: float, wall_s: float) -> list[Sample]:
     began = time.monotonic()
     first: list[int] = []
     last = [0.0]
+    problems = [""]
 
     def progress(_: Stream) -> None:
+        if stream.last_problem != problems[0]:
+            problems[0] = stream.last_problem
+            print(problems[0], flush=True)
         if not stream.stamp_ns():
             return
         if not first:

@@ -69,7 +69,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gts
     parameters.setRelativeErrorTol(1e-6)
     parameters.setAbsoluteErrorTol(1e-4)
     parameters.setMaxIterations(40)
-    parameters.setlambdaInitial(1e-8)
+    parameters.setlambdaInitial(1e-5)
     optimiser = gtsam.LevenbergMarquardtOptimizer(graph, start, parameters)
     with determined():
         values = optimiser.optimize()

@@ -72,23 +72,28 @@ def correlate(active: Active, values: gtsam.Values, system: LinearSystem, family
         return None
     variances = components(tracks, system)
     own, neighbours = variances[:-1], variances[-1]
-    found = root(tracks, system, own)
-    effect = _design_effect(tracks, values, system, found, neighbours)
+    found, effect = root(tracks, system, own), 1.0
+    influence = _influence_on_motions(tracks, values, system)
+    if influence is not None:
+        effect = _design_effect(tracks, system, influence, found, neighbours)
+        effect *= _track_effect(tracks, system, influence, found * np.sqrt(effect))
     return Correlation(found * np.sqrt(effect), _inflation(tracks, own * effect))
 
 
+def _influence_on_motions(tracks: "Tracks", values: gtsam.Values, system: LinearSystem) -> Float | None:
+    """How motions over a second follow the whitened errors, shape (rows, 6 motions); None without any."""
+    pairs = windows(tracks.stamps)
+    pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), MOTIONS)).round().astype(int)]
+    right = [system.selector(motion_blocks(values, tracks.keyframes[a], tracks.keyframes[b])) for a, b in pairs]
+    return np.asarray(system.A @ system.solve(np.hstack(right)), dtype=np.float64) if right else None
+
+
 def _design_effect(
-    tracks: "Tracks", values: gtsam.Values, system: LinearSystem, found: csr_matrix, neighbours: Float
+    tracks: "Tracks", system: LinearSystem, influence: Float, found: csr_matrix, neighbours: Float
 ) -> float:
     """Variance of motions with what neighbours share over that without (Kish 1965, design effect)."""
     if not neighbours.any():
         return 1.0
-    pairs = windows(tracks.stamps)
-    pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, min(len(pairs), MOTIONS)).round().astype(int)]
-    right = [system.selector(motion_blocks(values, tracks.keyframes[a], tracks.keyframes[b])) for a, b in pairs]
-    if not right:
-        return 1.0
-    influence = system.A @ system.solve(np.hstack(right))
     alone = (np.asarray(found.T @ influence) ** 2).sum(axis=0)
     own = tracks.gather(system, influence).sum(axis=1)
     shared = np.zeros(len(alone))
@@ -96,6 +101,24 @@ def _design_effect(
         for axis in range(2):
             shared += neighbours[axis] * (own[image, axis] * (kernel @ own[image, axis])).sum(axis=0)
     return 1.0 + float(np.median(shared / alone))
+
+
+def _track_effect(tracks: "Tracks", system: LinearSystem, influence: Float, found: csr_matrix) -> float:
+    """Variance of motions by what whole tracks contribute to them over what the errors' covariance says, at least one.
+
+    What a track contributes is a sum over its views, whatever makes them alike, and however much tracks differ in how
+    wrong they are (cluster-robust variance; Liang and Zeger 1986). Residuals are smaller than errors: those of errors
+    that are drawn from the covariance tell by how much.
+    """
+    errors = found @ np.random.default_rng(1).normal(size=(len(system.b), DRAWS))
+    residuals = np.column_stack([system.b, errors - system.A @ system.solve(system.A.T @ errors)])
+    own, seen = tracks.gather(system, influence), tracks.gather(system, residuals)
+    squares = []
+    for one in np.moveaxis(seen, -1, 0):
+        whole = np.zeros((int(tracks.track.max()) + 1, influence.shape[1]))
+        np.add.at(whole, tracks.track, (own * one[..., None]).sum(axis=(1, 2)))
+        squares.append((whole**2).sum(axis=0))
+    return max(float(np.mean(squares[0] / np.mean(squares[1:], axis=0))), 1.0)
 
 
 def root(tracks: "Tracks", system: LinearSystem, variances: Float) -> csr_matrix:

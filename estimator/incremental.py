@@ -60,6 +60,10 @@ class Cut:
     split: set[int]
     """Landmarks that stay, of which the factors of what leaves are taken for those of another point."""
 
+    def within(self, values: gtsam.Values) -> "Cut":
+        """The same for the variables that there are."""
+        return Cut(*({key for key in part if values.exists(key)} for part in (self.leaving, self.dropped, self.split)))
+
     def giving_up(self, key: int) -> "Cut | None":
         """The same without a landmark that nothing determines; None where the key is no landmark's."""
         if keys.kind(key) == keys.kind(keys.landmark_before(0)):
@@ -174,6 +178,7 @@ class Incremental:
             ObservabilityError: a variable that leaves is not determined.
         """
         values = self._stepped()
+        cut = cut.within(values)  # the step may have cost a landmark
         past = {key: keys.landmark_before(keys.index(key)) for key in cut.split}
         for key, before in past.items():
             values.insert(before, values.atPoint3(key))

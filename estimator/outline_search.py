@@ -11,7 +11,7 @@ from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import predict_outline
 from ..frontends.pipe.silhouette import OutlineFinder
 from .engine import Engine
-from .pipes import AXIS_ROLES, INSET_SHARE
+from .pipes import AXIS_ROLES
 from .sensors import PairImages
 
 Float = NDArray[np.float64]
@@ -23,11 +23,10 @@ OUTLINE_VIEWS = 16
 """Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.006, 0.02)
-"""Sigmas of axis [m] and direction [rad] with which a known pipe's outline is looked for."""
-EDGE_PX = 1.0
-"""A radius that was read from edges is known to so many pixels at the pipe's range, and to what its finish hides (see
-`pipes.INSET_SHARE`): the width of a known pipe's outline is looked for within both."""
+OUTLINE_PRIOR = (0.006, 0.02, 0.004)
+"""Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for. The radius's is
+measured, not derived: half, three quarters and one pixel at the pipe's range, with what its finish hides, each let edges
+within one pipe of twenty rendered recordings take its outline's place, see docs/kinect.md."""
 PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
 
@@ -85,10 +84,7 @@ class OutlineSearch:
             return
         ends = _part_of_axis(self._engine.pipes.places(pipe), axis)
         a, b = (where.o_T_c.transformTo(end) for end in ends)
-        model = self._engine.cameras[camera]
-        range_m = max(0.5 * float(a[2] + b[2]), 0.1)
-        width = float(np.hypot(EDGE_PX * range_m / model.fx, INSET_SHARE * axis[2]))
-        prior = predict_outline(model, a, b, axis[2], *OUTLINE_PRIOR, width)
+        prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
         if prior is not None:
             looked[pair.stamp_ns] = place
             self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))

@@ -7,8 +7,10 @@ import pytest
 from surecut.estimator.bounded import Bounded
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
+from surecut.estimator.graph import Record, Update
+from surecut.estimator.incremental import Cut, Incremental
 from surecut.estimator.limits import Limits
-from surecut.estimator.marginal import FAMILY, gaussian_of, marginal
+from surecut.estimator.marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
 from surecut.estimator.points_in_base import point_blocks
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors import keys
@@ -133,3 +135,50 @@ def nothing_hangs_on_what_has_left(engine, bounded):
     assert bounded.first > 0
     marks = {keys.index(key) for key in engine.state.values.keys() if keys.kind(key) == "l"}
     assert set(engine.odometry.observations) <= marks
+
+
+def test_landmark_that_is_given_up_takes_nothing_else_with_it():
+    """What earlier keyframes said about everything else stays, whether or not the landmark is in the graph still."""
+    graph, values, points = linear_graph()
+    prior = gaussian_of(graph, values, points[4:])
+    expected = gaussian_of(graph, values, points[5:])
+    left = without(prior, {points[4]})
+    assert left is not None
+    assert left.keys == expected.keys
+    np.testing.assert_allclose(left.H, expected.H, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(left.g, expected.g, rtol=1e-9, atol=1e-9)
+    assert without(prior, points[4:]) is None
+
+
+def test_renaming_leaves_the_factor_that_it_is_taken_from():
+    graph, values, points = linear_graph()
+    factor = gaussian_of(graph, values, points[4:]).factor()
+    before = keys.landmark_before(4)
+    torn = renamed(joint_of(factor, values), {points[4]: before}).factor()
+    assert set(torn.keys()) == {before, *points[5:]}
+    assert set(factor.keys()) == set(points[4:])
+    again = joint_of(factor, values)  # of its own variables still
+    assert set(again.keys) == set(points[4:])
+    moved = gtsam.Values()
+    for key in again.keys:
+        moved.insert(before if key == points[4] else key, values.atPoint3(key) + 0.1)
+    assert torn.error(moved) == pytest.approx(factor.error(shifted(values, again.keys)), rel=1e-9)
+
+
+def shifted(values, wanted):
+    found = gtsam.Values()
+    for key in wanted:
+        found.insert(key, values.atPoint3(key) + 0.1)
+    return found
+
+
+def test_cut_is_of_what_there_is():
+    """A landmark that the solver gave up meanwhile is not asked for."""
+    graph, values, points = linear_graph()
+    update = Update(values=values)
+    for i in range(graph.size()):
+        update.add(graph.at(i), Record("stereo odometry", "m_left", 0, "link"))
+    solver = Incremental()
+    solver.update(update)
+    left = solver.reduce(Cut({points[0], keys.landmark(99)}, {keys.landmark(98)}, {keys.landmark(97)}), 0)
+    assert set(left.keys()) == set(points[1:])

@@ -145,11 +145,14 @@ class Said(list):
 
     put = list.append
 
+    def qsize(self):
+        return 0
+
 
 def test_images_that_cannot_be_decoded_are_counted_by_topic():
     """A compressed image is decoded where it is used: there it turns out to be none."""
     out, look = Said(), Said()
-    loop = TrackLoop(RIG, False, look, out)
+    loop = TrackLoop(RIG, StreamSettings(), False, look, out)
     whole, broken = image(LEFT, 0), image(RIGHT, 0)
     pixels = CompressedPixels("png", np.frombuffer(b"\x89PNG\r\n\x1a\n no more", np.uint8))
     broken = replace(broken, body=ImageBody(pixels, RIGHT))

@@ -16,8 +16,9 @@ from ...frontends.undistort import distort
 from ...io.live.interfaces import Outline
 from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
+from ..bundle import Bundle
 from ..items import Item, unreadable
-from ..sensing import Sensing, images
+from ..sensing import Sensed, Sensing, images
 from ..sensors import PairImages
 from .parent import LOOK_NICE, end_with_parent, give_way
 from .settings import StreamSettings
@@ -114,9 +115,22 @@ class LookLoop:
         self._note(items)
         sensed = self._sensing.look(items, frame)
         self._remember(sensed.bundle.frame)
-        self._thinning.put(sensed)
+        self._hand_on(sensed)
         del self._sensing.sensors.rejected[:-REFUSALS]
         return self._outlines(sensed.bundle.sightings)
+
+    def _hand_on(self, sensed: Sensed) -> None:
+        """To the graph; without its frame where the graph is behind."""
+        bundle = sensed.bundle
+        if bundle.frame is not None:
+            frame = self._thinning.offered(bundle.frame, dear=bool(bundle.picks))
+            if frame is not None:
+                sensed = replace(sensed, bundle=replace(bundle, frame=frame))
+            elif sensed.depth is not None or sensed.cameras:
+                sensed = Sensed(Bundle(sensed.stamp_ns), sensed.depth, cameras=sensed.cameras)
+            else:
+                return
+        self._graph.put(sensed)
 
     def _note(self, items: list[Item]) -> None:
         for item in items:

@@ -1,4 +1,4 @@
-"""A graph that does not keep up gets fewer frames, so that nobody has to wait for it.
+"""Who does not keep up gets fewer frames, so that nobody has to wait for it.
 
 A frame that is left out is not lost: its motion becomes a part of the next one's, and its tracks live on in the
 keyframes that follow.
@@ -8,20 +8,18 @@ from dataclasses import replace
 from typing import Any
 
 from ...factors.measurements import StereoFrame
-from ..bundle import Bundle
-from ..sensing import Sensed
 from .settings import StreamSettings
 
 
 class Thinning:
-    """Before the graph's queue.
+    """Before the queue of a process.
 
     Args:
         patient: whoever sends waits: nothing is left out.
     """
 
-    def __init__(self, graph: Any, settings: StreamSettings, patient: bool) -> None:
-        self._graph = graph
+    def __init__(self, inbox: Any, settings: StreamSettings, patient: bool) -> None:
+        self._inbox = inbox
         self._settings = settings
         self._patient = patient
         self._kept: StereoFrame | None = None
@@ -29,24 +27,29 @@ class Thinning:
         self._keyframe_ns: int | None = None
         self._left_out = 0
 
-    def put(self, sensed: Sensed) -> None:
-        """Hands on what was seen, or leaves out its frame."""
-        bundle = sensed.bundle
-        frame = bundle.frame
-        if frame is None:
-            self._graph.put(sensed)
-            return
+    def offered(self, frame: StereoFrame, dear: bool) -> StereoFrame | None:
+        """The frame to hand on, with the motion of those before it that were left out; None: it is one of them.
+
+        Args:
+            dear: it has to be handed on, such as one that was clicked in.
+        """
         frame = joined(self._kept, frame)
-        if self._spared(frame) and not bundle.picks:
+        if self._spared(frame) and not dear:
             self._kept, self._left_out = frame, self._left_out + 1
-            if sensed.depth is not None or sensed.cameras:
-                rest = Bundle(sensed.stamp_ns)
-                self._graph.put(Sensed(rest, sensed.depth, cameras=sensed.cameras))
-            return
+            return None
         self._kept = None
         if frame.is_keyframe:
             self._keyframe_ns = frame.stamp_ns
-        self._graph.put(replace(sensed, bundle=replace(bundle, frame=frame)))
+        return frame
+
+    def behind(self) -> bool:
+        """Does the process keep up so badly that frames are left out?"""
+        if self._patient:
+            return False
+        try:
+            return self._inbox.qsize() >= self._settings.thin_from
+        except NotImplementedError:  # macOS cannot tell
+            return False
 
     def taken(self) -> int:
         """How many frames have been left out since this was asked last."""
@@ -54,15 +57,9 @@ class Thinning:
         return number
 
     def _spared(self, frame: StereoFrame) -> bool:
-        if self._patient or self._backlog() < self._settings.thin_from or self._keyframe_ns is None:
+        if self._keyframe_ns is None or not self.behind():
             return False
         return not frame.is_keyframe or 0 <= frame.stamp_ns - self._keyframe_ns < self._settings.thin_ns
-
-    def _backlog(self) -> int:
-        try:
-            return self._graph.qsize()
-        except NotImplementedError:  # macOS cannot tell
-            return 0
 
 
 def joined(before: StereoFrame | None, frame: StereoFrame) -> StereoFrame:

@@ -1,6 +1,5 @@
 """The tracking's process: it does nothing that a pose has to wait for but the pose."""
 
-import queue
 import time
 import traceback
 from typing import Any
@@ -14,10 +13,12 @@ from ...io.pairing import StereoPair
 from ..items import Item, unreadable
 from ..sensing import Sensing
 from .parent import end_with_parent
+from .settings import StreamSettings
+from .thinning import Thinning
 from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
 
 
-def track(rig: Rig, patient: bool, inbox: Any, look: Any, out: Any) -> None:
+def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: Any, out: Any) -> None:
     """The process. `inbox`, `look` and `out` are queues between processes.
 
     Args:
@@ -26,7 +27,7 @@ def track(rig: Rig, patient: bool, inbox: Any, look: Any, out: Any) -> None:
     end_with_parent()
     cv2.setNumThreads(1)
     try:
-        loop = TrackLoop(rig, patient, look, out)
+        loop = TrackLoop(rig, settings, patient, look, out)
         out.put(Ready("tracking"))
         while True:
             item = inbox.get()
@@ -37,7 +38,7 @@ def track(rig: Rig, patient: bool, inbox: Any, look: Any, out: Any) -> None:
                 if item.what == "finish":
                     return
                 if item.what == "reset":
-                    loop = TrackLoop(rig, patient, look, out, loop.calibrations)
+                    loop = TrackLoop(rig, settings, patient, look, out, loop.calibrations)
     except Exception:
         out.put(Died("tracking", traceback.format_exc()))
 
@@ -50,10 +51,16 @@ class TrackLoop:
     """
 
     def __init__(
-        self, rig: Rig, patient: bool, look: Any, out: Any, calibrations: dict[str, Message] | None = None
+        self,
+        rig: Rig,
+        settings: StreamSettings,
+        patient: bool,
+        look: Any,
+        out: Any,
+        calibrations: dict[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
-        self._patient = patient
+        self._thinning = Thinning(look, settings, patient)
         self._look = look
         self._out = out
         self.calibrations = calibrations or {}
@@ -82,15 +89,19 @@ class TrackLoop:
             self._hand_on(Tracked(items, frame))
 
     def _hand_on(self, tracked: Tracked) -> None:
-        """To the other front ends. Where these are far behind, what is only about surfaces is left out: the pose of
-        the camera must not wait for it."""
-        if not self._patient and all(_surfaces_only(item) for item in tracked.items):
-            try:
-                self._look.put_nowait(tracked)
-            except queue.Full:
-                self._out.put(Worked({}, 0, None, 0, 0.0, left_out=len(tracked.items)))
+        """To the other front ends. Where these are behind, frames and what is only about surfaces are left out: the
+        pose of the camera must not wait for them."""
+        frame = tracked.frame
+        if frame is not None:
+            dear = any(not isinstance(item, StereoPair) for item in tracked.items)
+            frame = self._thinning.offered(frame, dear)
+            if frame is None:
+                self._out.put(Worked({}, 0, None, 0, 0.0, thinned=self._thinning.taken()))
+                return
+        elif self._thinning.behind() and all(_surfaces_only(item) for item in tracked.items):
+            self._out.put(Worked({}, 0, None, 0, 0.0, left_out=len(tracked.items)))
             return
-        self._look.put(tracked)
+        self._look.put(Tracked(tracked.items, frame))
 
 
 def _surfaces_only(item: Item) -> bool:
