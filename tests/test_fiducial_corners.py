@@ -1,10 +1,13 @@
 """Corners against rendered truth: bias, scatter, honesty, and the order of the corners."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fiducial_scenes import PAGE_M, a4_board, camera, pose
 
 from surecut.factors.rig import Rig
+from surecut.frontends.fiducials import pattern_fit
 from surecut.frontends.fiducials.detector import MarkerFrontEnd
 from surecut.frontends.fiducials.dictionaries import all_names, canonical_name, marker_dictionary
 from surecut.simulation.marker_images import Photography, marker_corners, project, render_board
@@ -113,3 +116,17 @@ def test_patterns_have_a_black_border_and_differ_from_their_turns(name):
     assert pattern.shape == (dictionary.cells, dictionary.cells)
     assert not border.any()
     assert all((np.rot90(pattern, k) != pattern).any() for k in (1, 2, 3))
+
+
+@pytest.mark.parametrize("rays", [3, 4])
+def test_edges_that_are_off_as_a_whole_are_in_the_covariance(rays, monkeypatch):
+    """Few rays a pixel see a part of its area only: upright edges are off by their place in the pixel. Without the
+    variance of whole edges the covariance knows nothing of it."""
+    lens = camera(230, 230, 270)
+    poses = [pose(3.0, 40.0 * k, 0.5 * k, [0.002 * k, 0.003 * k, 0.62 + 0.01 * k]) for k in range(8)]
+    taken = Photography(blur_px=0.6, noise=1.0, supersampling=rays)
+    nees = measure(a4_board(), lens, poses, taken)[2]
+    assert 0.4 < nees.mean() < 2.0
+    whole = pattern_fit.edge_errors
+    monkeypatch.setattr(pattern_fit, "edge_errors", lambda *a: replace(whole(*a), variance_px2=0.0))
+    assert measure(a4_board(), lens, poses, taken)[2].mean() > 2.0 * nees.mean()
