@@ -67,7 +67,7 @@ class Engine:
         self.state, self.solver = self.graph.state, self.graph.solver
         sigma = rig.gates.robust_sigma
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
-        self.odometry.gate.joint_covariance = self.solver.joint_covariance
+        self.odometry.gate.joint_covariance = self.graph.joint_covariance
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
