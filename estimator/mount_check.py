@@ -116,8 +116,8 @@ def _test_from(
 ) -> MountTest | None:
     """The test with landmarks on the surfaces that are near from one place of {b}.
 
-    Few landmarks find other surfaces from another place. A mount is contradicted where neither its own place nor that of
-    the registration agrees with it.
+    Few landmarks find other surfaces from another place. A mount is contradicted where neither its own place nor that
+    of the registration agrees with it.
     """
     mount, cloud, base = engine.rig.mount, engine.surfaces.cloud, engine.base
     assert mount is not None
