@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from ..factors.calibration import depth_sigmas, rgb_mean
+from ..factors.calibration import depth_sigmas, rgb_mean, rgb_sigmas
 from ..factors.geometry import pose3
 from ..frontends.cloud.point_registration import PointRegistration, register_points
 from ..frontends.cross_view import MappedFeatures, features, find_view, mapped_features
@@ -23,6 +23,21 @@ SPACING_M, SPACING_RAD = 0.3, 0.35
 MOST_VIEWS = 40
 FIRST_VIEWS = 8
 """So many views before the first search, and so many more before each further one."""
+
+
+BY_COLOUR_RAD, BY_COLOUR_M = 0.04, 0.12
+"""What matches that agree by chance do to a place by colour, beyond its own covariance. Measured: 25 mrad and 80 mm rms
+in the worst direction over 13 places in five rendered recordings, 65 mrad and 240 mm the largest."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Guess:
+    """`o_T_b` by colour."""
+
+    o_T_b: Float
+    """Shape (4, 4)."""
+    covariance: Float
+    """Shape (6, 6), of xi in o_T_b * Exp(xi), rotation first."""
 
 
 @dataclass(slots=True)
@@ -68,26 +83,35 @@ class BaseSearch:
             return False
         self._searched = len(self._views)
         guess = self._by_colour(view)
-        found = None if guess is None else self._on_surfaces(guess, view)
-        if found is None or not found.plausible:
+        found = None if guess is None else self._on_surfaces(guess.o_T_b, view)
+        if guess is None or found is None or not found.plausible:
             return False
         what = f"{found.on_surface} landmarks on the Kinect's surfaces, {found.contradictions} before them"
-        engine.machine.enter_by_surfaces(pose3(found.o_T_b), view.cloud.stamp_ns, what)
+        by_colour = pose3(guess.o_T_b), guess.covariance
+        engine.machine.enter_by_surfaces(pose3(found.o_T_b), by_colour, view.cloud.stamp_ns, what)
         return True
 
     def _on_surfaces(self, guess: Float, view: DepthView) -> PointRegistration | None:
         sigmas = depth_sigmas(self._engine.rig.kinect)
         return register_points(landmark_map(self._engine).points, view.cloud, guess, sigmas)
 
-    def _by_colour(self, view: DepthView) -> Float | None:
+    def _by_colour(self, view: DepthView) -> _Guess | None:
         """`o_T_b` from the colour image's features among those of the mobile camera; None where they do not meet."""
         engine = self._engine
         camera = engine.cameras.get("b_rgb")
         if view.colour is None or camera is None:
             return None
         mapped = [self._mapped(v) for v in self._views]
-        found = find_view(mapped, features(view.colour, camera), camera)
-        return None if found is None else found.o_T_c @ inverse(rgb_mean(engine.rig.kinect).matrix())
+        lens = engine.rig.cameras.b_rgb
+        sigmas = lens.focal_sigma_rel, lens.centre_sigma_px
+        found = find_view(mapped, features(view.colour, camera), camera, sigmas)
+        if found is None:
+            return None
+        b_T_rgb = rgb_mean(engine.rig.kinect)
+        turn = b_T_rgb.AdjointMap()
+        covariance = found.covariance + np.diag(rgb_sigmas(engine.rig.kinect) ** 2)
+        by_chance = np.diag([BY_COLOUR_RAD**2] * 3 + [BY_COLOUR_M**2] * 3)
+        return _Guess(found.o_T_c @ b_T_rgb.inverse().matrix(), turn @ covariance @ turn.T + by_chance)
 
     def _mapped(self, view: _View) -> MappedFeatures:
         """A view's features in {o}, where its keyframe is believed to be now."""

@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 
 import gtsam
+import numpy as np
+from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.geometry import pose3
-from ..factors.links import mount_factor, mount_pose, weak_pose_prior
+from ..factors.links import mount_factor, mount_pose
 from ..factors.measurements import BaseMove, Event, MarkerSighting
+from ..factors.noise import gaussian
 from ..factors.rig import Rig
 from ..frontends.resection import camera_pose
 from .boards import Boards
@@ -19,6 +22,8 @@ from .surfaces import Surfaces
 
 COLOUR_VIEWS = 60
 """Colour images of boards that wait for the machine's place: the last minute."""
+LAY_ROUNDS = 3
+"""Landmarks are laid anew after each solution: the first place of {b} is not good enough for all of them."""
 COLOUR_GATE_PX = 5.0
 """Median error with which a board in the colour image may place the machine first."""
 
@@ -68,13 +73,34 @@ class Machine:
         self._graph.take(update)
         return True
 
-    def enter_by_surfaces(self, o_T_b: gtsam.Pose3, stamp_ns: int, what: str) -> None:
-        """{b} by surfaces that both cameras see: landmarks on them hold it, and leave loose what they do not fix."""
+    def enter_by_surfaces(
+        self, o_T_b: gtsam.Pose3, by_colour: tuple[gtsam.Pose3, NDArray[np.float64]], stamp_ns: int, what: str
+    ) -> None:
+        """{b} by surfaces that both cameras see.
+
+        Landmarks on them hold it. What few of them leave loose, such as a turn about the normal of a wall, the colours
+        hold: noise alone would carry {b} so far that nothing lies on a surface any more.
+
+        Args:
+            o_T_b: where the surfaces put it.
+            by_colour: `o_T_b` and its covariance, of other measurements than those of surfaces.
+        """
         update = Update()
         update.guess(self.base, o_T_b)
-        record = Record("gauge", "start of {b}", stamp_ns, "weak prior of {b}", rejectable=False)
-        update.add(weak_pose_prior(self.base, o_T_b, 3.0, 3.0), record)
+        record = Record(
+            "colour view", "place of {b} by colour", stamp_ns, "{b} by features in colour", rejectable=False
+        )
+        pose, covariance = by_colour
+        update.add(gtsam.PriorFactorPose3(self.base, pose, gaussian(covariance)), record)
         self._graph.take(update)
+        for _ in range(LAY_ROUNDS):
+            self.lay_all_landmarks()
+            self._graph.flush()
+        self._events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
+
+    def lay_all_landmarks(self) -> None:
+        """Those that lay on no surface may do so now that {b} is known better."""
+        self._surfaces.retry()
         by_keyframe: dict[int, dict[int, int]] = {}
         for track, index in self._odometry.seen_in.items():
             by_keyframe.setdefault(index, {})[track] = self._odometry.observations[track]
@@ -83,8 +109,6 @@ class Machine:
                 continue  # it has left the graph
             pose = self._state.pose(keys.keyframe(index))
             self._graph.take(self._surfaces.lay(self.base, pose, observations))
-        self._events.append(Event(stamp_ns, "base_by_cloud", f"{{b}} was placed without a board: {what}", "info"))
-        self._graph.flush()
 
     def move(self, move: BaseMove) -> None:
         """The machine stands elsewhere now: a new {b}, and the landmarks are laid on what it sees from there."""

@@ -67,7 +67,12 @@ class MountTest:
             f"{np.degrees(self.turn_sigma_rad):.1f} degrees from the rig file's f_T_b of board {self.board} "
             f"({self.sigma:.1f} sigma); measure the mount again"
         )
-        values = {"sigma": self.sigma, "shift_m": self.shift_m, "turn_rad": self.turn_rad}
+        values = {
+            "sigma": self.sigma,
+            "shift_m": self.shift_m,
+            "turn_rad": self.turn_rad,
+            "turn_sigma_rad": self.turn_sigma_rad,
+        }
         return Event(self.stamp_ns, "mount_wrong", text, "error" if self.sigma > ERROR_SIGMA else "warning", values)
 
 
@@ -102,8 +107,23 @@ def mount_test(engine: Engine, active: Active, system: LinearSystem, values: gts
     placed = register_points(found.points, cloud, guess, depth_sigmas(engine.rig.kinect))
     if placed is None or not placed.plausible:
         return None
+    tests = [_test_from(start, engine, found, active, system, values) for start in (pose3(placed.o_T_b), pose3(guess))]
+    return min((test for test in tests if test is not None), key=lambda test: test.sigma, default=None)
+
+
+def _test_from(
+    o_T_b: gtsam.Pose3, engine: Engine, found: LandmarkMap, active: Active, system: LinearSystem, values: gtsam.Values
+) -> MountTest | None:
+    """The test with landmarks on the surfaces that are near from one place of {b}.
+
+    Few landmarks find other surfaces from another place. A mount is contradicted where neither its own place nor that
+    of the registration agrees with it.
+    """
+    mount, cloud, base = engine.rig.mount, engine.surfaces.cloud, engine.base
+    assert mount is not None
+    assert cloud is not None
     start = gtsam.Values(values)
-    start.update(base, pose3(placed.o_T_b))
+    start.update(base, o_T_b)
     planes = _planes(found, cloud, base, start, engine.rig.gates.robust_sigma)
     kept = [i for i, (_, _, record) in enumerate(active) if record.family not in ("mount", CLOUD, CYLINDER)]
     root = _root_of(system, kept)

@@ -79,6 +79,10 @@ class Surfaces:
         self._laid.clear()
         self._shared.clear()
 
+    def retry(self) -> None:
+        """{b} has moved: landmarks that lay on no surface are due again."""
+        self._tried.clear()
+
     def lay(self, base: int, camera: gtsam.Pose3, observations: dict[int, int]) -> Update:
         """Plane factors for landmarks that were not laid yet.
 

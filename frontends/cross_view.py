@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.camera import CameraModel
+from .stereo.geometry import transform
 from .undistort import undistort
 
 Float = NDArray[np.float64]
@@ -52,6 +53,8 @@ class FoundView:
 
     o_T_c: Float
     """Shape (4, 4)."""
+    covariance: Float
+    """Shape (6, 6), of xi in o_T_c * Exp(xi), rotation first."""
     inliers: int
     matches: int
 
@@ -89,8 +92,14 @@ def mapped_features(
     return MappedFeatures(left.descriptors[matches[good, 0]], s[good, None] * rays[good])
 
 
-def find_view(mapped: list[MappedFeatures], view: Features, camera: CameraModel) -> FoundView | None:
-    """The pose of a camera among mapped features of several keyframes, all in one frame; None when it is not found."""
+def find_view(
+    mapped: list[MappedFeatures], view: Features, camera: CameraModel, lens_sigmas: tuple[float, float] = (0.0, 0.0)
+) -> FoundView | None:
+    """The pose of a camera among mapped features of several keyframes, all in one frame; None when it is not found.
+
+    Args:
+        lens_sigmas: of its focal length (a part of it) and of its principal point (px).
+    """
     points, px = [], []
     for part in mapped:
         matches = _matches(part.descriptors, view.descriptors)
@@ -109,7 +118,45 @@ def find_view(mapped: list[MappedFeatures], view: Features, camera: CameraModel)
     rotation, translation = cv2.solvePnPRefineLM(o_p[index], seen[index], camera.K, None, rotation, translation)
     c_T_o = np.eye(4)
     c_T_o[:3, :3], c_T_o[:3, 3] = cv2.Rodrigues(rotation)[0], np.ravel(translation)
-    return FoundView(np.asarray(np.linalg.inv(c_T_o), np.float64), len(index), len(o_p))
+    covariance = _covariance(transform(c_T_o, o_p[index]), seen[index], camera, *lens_sigmas)
+    return FoundView(np.asarray(np.linalg.inv(c_T_o), np.float64), covariance, len(index), len(o_p))
+
+
+def _covariance(c_p: Float, px: Float, camera: CameraModel, focal_sigma_rel: float, centre_sigma_px: float) -> Float:
+    """Of a pose by points seen at pixels, the noise being that of the residuals; the lens model's errors beside it.
+
+    A feature of the picture that several keyframes mapped counts once: its points share the error of its place in the
+    picture, and most of that of their own.
+
+    Args:
+        c_p: shape (n, 3), in the camera's frame. px: shape (n, 2).
+    """
+    x, y, z = c_p.T
+    zero = np.zeros_like(z)
+    by_point = np.stack(
+        (
+            np.column_stack((camera.fx / z, zero, -camera.fx * x / z**2)),
+            np.column_stack((zero, camera.fy / z, -camera.fy * y / z**2)),
+        ),
+        axis=1,
+    )
+    cross = np.stack(
+        (np.column_stack((zero, -z, y)), np.column_stack((z, zero, -x)), np.column_stack((-y, x, zero))), 1
+    )
+    J = np.concatenate((by_point @ cross, -by_point), axis=2).reshape(-1, 6)
+    seen = np.column_stack((x / z, y / z))
+    residual = seen * (camera.fx, camera.fy) + (camera.cx, camera.cy) - px
+    variance = float((residual**2).sum()) / (2 * len(px) - 6)
+    repeats = len(px) / len(np.unique(px, axis=0))
+    information = J.T @ J
+    focal, centre_x, centre_y = (
+        seen * (camera.fx, camera.fy),
+        np.tile((1.0, 0.0), len(px)),
+        np.tile((0.0, 1.0), len(px)),
+    )
+    shared = np.column_stack((focal_sigma_rel * focal.ravel(), centre_sigma_px * centre_x, centre_sigma_px * centre_y))
+    moved = np.linalg.solve(information, J.T @ shared)
+    return np.asarray(variance * repeats * np.linalg.inv(information) + moved @ moved.T, np.float64)
 
 
 def _matches(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ from surecut.factors.geometry import pose3
 from surecut.factors.measurements import CloudFrame
 from surecut.factors.rig import Pose
 from surecut.frontends.cloud.point_registration import MapPoints, register_points
-from surecut.frontends.cross_view import features, find_view, mapped_features
+from surecut.frontends.cross_view import Features, MappedFeatures, features, find_view, mapped_features
 from surecut.simulation.measurement_level import draw
 from surecut.simulation.measurement_level_scenario import Clouds, Scenario, Tracks
 
@@ -212,6 +212,30 @@ def test_a_camera_is_found_among_stereo_features():
     assert find_view([mapped], features(blank, other), other) is None
 
 
+def found_among_points(seed, lens_sigmas=(0.0, 0.0)):
+    """A camera at 2 m from points that two keyframes mapped, seen with 1 px noise: error and covariance."""
+    rng, model = np.random.default_rng(seed), camera("b_rgb", 640, 480, 525.0)
+    c_p = np.column_stack((rng.uniform(-1.0, 1.0, 150), rng.uniform(-0.7, 0.7, 150), rng.uniform(1.6, 2.6, 150)))
+    px = c_p[:, :2] / c_p[:, 2:] * 525.0 + (model.cx, model.cy) + rng.normal(0, 1.0, (150, 2))
+    names, o_T_c = rng.normal(0, 1, (150, 128)).astype(np.float32), pose((0.1, 0.4, -0.2), (0.5, 0.1, -0.3))
+    mapped = MappedFeatures(names, c_p @ o_T_c[:3, :3].T + o_T_c[:3, 3])
+    found = find_view([mapped, mapped], Features(names, px), model, lens_sigmas)
+    assert found is not None
+    return tangent(np.linalg.inv(o_T_c) @ found.o_T_c), found.covariance
+
+
+def test_the_covariance_of_a_camera_among_points_is_that_of_its_errors():
+    scores = [
+        error @ np.linalg.solve(covariance, error) / 6 for error, covariance in map(found_among_points, range(20))
+    ]
+    assert 0.7 < np.mean(scores) < 1.4
+
+
+def test_a_focal_length_that_is_off_is_a_distance_that_is_off():
+    (_, sure), (_, unsure) = found_among_points(3), found_among_points(3, (0.02, 0.0))
+    assert np.sqrt(unsure[5, 5] - sure[5, 5]) == pytest.approx(0.02 * 2.1, rel=0.5)
+
+
 @pytest.fixture(scope="module")
 def run():
     # no panel: Kinect and mobile camera see the same walls
@@ -257,7 +281,7 @@ def test_without_a_board_the_cloud_alone_holds_the_point_in_its_region(run):
     placed = register_points(landmark_map(engine).points, engine.surfaces.cloud, guess, DEPTH_SIGMAS)
     assert placed is not None
     assert placed.plausible
-    engine.machine.enter_by_surfaces(pose3(placed.o_T_b), 0, "a guess")
+    engine.machine.enter_by_surfaces(pose3(placed.o_T_b), (pose3(guess), np.eye(6) * 0.12**2), 0, "a guess")
     result = finish(engine)
     assert [event.kind for event in result.events if event.kind == "base_by_cloud"]
     for point in result.points:
@@ -265,3 +289,23 @@ def test_without_a_board_the_cloud_alone_holds_the_point_in_its_region(run):
         assert error @ np.linalg.solve(point.covariance_m2, error) < chi2.ppf(0.999, 3)
         assert np.linalg.norm(error) < point.radius95_m * 1.3
         assert point.radius95_m < 0.3
+
+
+def test_what_one_wall_leaves_loose_the_colours_hold(run):
+    engine = estimator(run, run.rig.model_copy(update={"mount": None, "boards": (), "distances": (), "pipes": ()}))
+    cloud = engine.surfaces.cloud
+    main = cloud.normals[np.argmax((cloud.normals @ cloud.normals.T > 0.95).sum(axis=1))]
+    wall = cloud.normals @ main > 0.95
+    parts = (cloud.points_m, cloud.normals, cloud.sigma_m, cloud.planarity_m, cloud.bias_m)
+    engine.surfaces.cloud = CloudFrame(cloud.stamp_ns, *(part[wall] for part in parts))
+    spread = np.diag([0.04**2] * 3 + [0.12**2] * 3)
+    off = pose((0.02, -0.02, 0.02), (0.03, -0.05, 0.04))
+    engine.machine.enter_by_surfaces(pose3(run.truth.o_T_b), (pose3(run.truth.o_T_b @ off), spread), 0, "a guess")
+    found = engine.state.pose(engine.base).matrix()
+    error = tangent(np.linalg.inv(run.truth.o_T_b) @ found)
+    assert (np.abs(error) < 3.0 * np.sqrt(np.diag(spread))).all()
+    found = engine.solver.joint_covariance([engine.base])
+    assert np.linalg.eigvalsh(spread - found).min() > -1e-3 * 0.12**2
+    along = np.linalg.svd(main[None, :])[2][1:]
+    across_m, along_m = main @ found[3:, 3:] @ main, np.diag(along @ found[3:, 3:] @ along.T)
+    assert np.sqrt(along_m.min() / across_m) > 1.5  # a wall says less of the place along it

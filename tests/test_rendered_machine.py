@@ -67,7 +67,9 @@ def test_a_mount_off_by_20_mm_and_2_degrees_is_named(log, tmp_path):
     assert cloud_path(result) > 3.0
     told = next(event for event in result.events if event.kind == "mount_wrong")
     assert told.severity == "error"
-    assert told.values["turn_rad"] == pytest.approx(np.deg2rad(2.0), abs=np.deg2rad(1.5))
+    # 25 landmarks hold the turn to 1.4 degrees (1 sigma) in this recording
+    assert told.values["turn_sigma_rad"] < np.deg2rad(2.0)
+    assert told.values["turn_rad"] == pytest.approx(np.deg2rad(2.0), abs=2.0 * told.values["turn_sigma_rad"])
     assert "measure the mount again" in told.text
 
 
