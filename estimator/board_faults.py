@@ -36,7 +36,7 @@ KNOCK_FALSE_ALARM = 1e-6
 SAME_PLACE = 1e-5
 """rad and m: nothing, against what any log shows."""
 ROUNDS = 6
-SETTLE_ROUNDS = 10
+SETTLE_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,17 +49,25 @@ class Engine:
     """Graph, iSAM2 and the sensors' book-keeping of one run."""
 
     def __init__(
-        self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator, advises: bool = True
-    ) -> None:
+        self, rig: Rig, cameras: Mapping[str, CameraModel], associate: Associator, advises: bool = True,
+        together: int = 1,
+    ) -> None:  # fmt: skip
+        """
+        Args:
+            associate: lays landmarks on surfaces.
+            advises: the result tells what to measure next; campaigns do without.
+            together: keyframes that share an update of the solver. Calibration ties all of them together, so that each
+                update costs a good part of a batch solution; where nobody waits for the answer, some can share it.
+        """
         self.rig = rig
         self.advises = advises
-        """The result tells what to measure next; campaigns do without."""
+        self._together = together
         self.cameras = dict(cameras)
         self.graph = OpenGraph()
         self.state, self.solver = self.graph.state, self.graph.solver
         sigma = rig.gates.robust_sigma
         self.odometry = Odometry(self.state, OdometrySettings(), sigma)
-        self.odometry.gate.joint_covariance = self.solver.joint_covariance
+        self.odometry.gate.joint_covariance = self.graph.joint_covariance
         self.boards = Boards(rig, self.state)
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
@@ -109,8 +117,9 @@ class Engine:
             self.add_outline(outline)
         for cylinder in bundle.cylinders:
             self.add_cylinder(cylinder.pipe_id, self.base, cylinder)
-        urgent = bundle.frame is not None or bundle.picks or bundle.outlines or bundle.cloud is not None
-        return self.flush() if urgent or self._unsolved >= MARKER_KEYFRAMES else False
+        urgent = bundle.picks or bundle.outlines or bundle.cloud is not None
+        most = MARKER_KEYFRAMES if bundle.frame is None else self._together
+        return self.flush() if urgent or self._unsolved >= most else False
 
     def flush(self) -> bool:
         """One iSAM2 update with what has gathered."""
@@ -152,7 +161,8 @@ class Engine:
         self.graph.take(self.distances.close(bundle.stamp_ns))
         self._unsolved += 1
         if bundle.frame is not None:
-            self.flush()
+            if self.adrift or self._unsolved >= self._together:
+                self.flush()
             if not self.adrift:
                 self.machine.lay_landmarks(index)
 

@@ -2,6 +2,11 @@
 
 import gtsam
 
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
 from .graph import State, Update
 from .incremental import Incremental
 
@@ -37,3 +42,12 @@ class OpenGraph:
     def relocate(self, values: gtsam.Values) -> None:
         """Other values, from which the solver begins anew at the next update; nothing may be waiting."""
         self.state.values = self.solver.relocate(values)
+
+    def joint_covariance(self, keys: Sequence[int]) -> NDArray[np.float64]:
+        """Joint covariance of some variables with all that has gathered, in the order of `keys`.
+
+        Raises:
+            ObservabilityError: one of them is not determined.
+        """
+        self.flush()
+        return self.solver.joint_covariance(keys)

@@ -15,6 +15,9 @@ from .result import Result
 from .sensed_log import SensedLog, opened
 from .stopwatch import Stopwatch
 
+TOGETHER = 3
+"""Keyframes that share an update of the solver: nobody waits for the answer in between."""
+
 Progress = Callable[[int], None]
 """Called with each stamp (ns) that has been worked in."""
 
@@ -59,7 +62,7 @@ def optimise(
         from .pipeline import Pipeline
         from .run import finish
 
-        pipeline = Pipeline(rig)
+        pipeline = Pipeline(rig, together=TOGETHER)
         with watch("run"):
             for stamp_ns in pipeline.run(recording):
                 if progress is not None:

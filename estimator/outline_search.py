@@ -41,6 +41,8 @@ class OutlineSearch:
         self._kept_bytes = 0
         self._looked: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
+        self._passed: dict[str, set[int]] = {}
+        """Stamps of views too near to one of these."""
 
     def see(self, pair: PairImages, picks: Sequence[Pick]) -> None:
         """A keyframe's pictures, and the clicks in them."""
@@ -48,16 +50,18 @@ class OutlineSearch:
         self._kept_bytes += pair.nbytes
         while self._kept_bytes > KEPT_BYTES or self._kept[0].stamp_ns not in self._engine.keyframe_at:
             self._kept_bytes -= self._kept.popleft().nbytes
-        for pick in picks:
-            if pick.role in AXIS_ROLES and pick.camera in MOBILE:
-                self._about(pick, pair)
-        self._engine.flush()
+        clicked = [pick for pick in picks if pick.role in AXIS_ROLES and pick.camera in MOBILE]
+        for pick in clicked:
+            self._about(pick, pair)
+        if clicked:
+            self._engine.flush()
+        found = 0
         for pipe in list(self._engine.pipes.cylinders):
-            if self._engine.pipes.axis(pipe) is not None:
-                for kept in list(self._kept):
-                    for camera in MOBILE:
-                        self._where_predicted(pipe, camera, kept)
-        self._engine.flush()
+            axis = self._engine.pipes.axis(pipe)
+            if axis is not None:
+                found += sum(self._where_predicted(pipe, axis, camera) for camera in MOBILE)
+        if found:
+            self._engine.flush()
 
     def _about(self, pick: Pick, pair: PairImages) -> None:
         """The outline about a click."""
@@ -70,24 +74,29 @@ class OutlineSearch:
             looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
             looked[pair.stamp_ns] = where.o_T_c.translation()
 
-    def _where_predicted(self, pipe: str, camera: str, pair: PairImages) -> None:
-        """Looks for a known pipe's outline, in views that differ from those already used."""
+    def _where_predicted(self, pipe: str, axis: tuple[Float, Float, float], camera: str) -> int:
+        """Looks for a known pipe's outline in views that differ from those already used; in how many."""
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
-        if len(looked) >= OUTLINE_VIEWS or pair.stamp_ns in looked:
-            return
-        axis = self._engine.pipes.axis(pipe)
-        where = self._engine.seen_from(camera, pair.stamp_ns)
-        if axis is None or where is None:
-            return
-        place = where.o_T_c.translation()
-        if looked and (np.linalg.norm(place - np.array([*looked.values()]), axis=1) < OUTLINE_SPACING_M).any():
-            return
+        passed = self._passed.setdefault(f"{pipe} {camera}", set())
         ends = _part_of_axis(self._engine.pipes.places(pipe), axis)
-        a, b = (where.o_T_c.transformTo(end) for end in ends)
-        prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
-        if prior is not None:
-            looked[pair.stamp_ns] = place
-            self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))
+        found = 0
+        for pair in [kept for kept in self._kept if kept.stamp_ns not in looked and kept.stamp_ns not in passed]:
+            if len(looked) >= OUTLINE_VIEWS:
+                break
+            where = self._engine.seen_from(camera, pair.stamp_ns)
+            if where is None:
+                continue
+            place = where.o_T_c.translation()
+            if looked and (np.linalg.norm(place - np.array([*looked.values()]), axis=1) < OUTLINE_SPACING_M).any():
+                passed.add(pair.stamp_ns)
+                continue
+            a, b = (where.o_T_c.transformTo(end) for end in ends)
+            prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
+            if prior is not None:
+                looked[pair.stamp_ns] = place
+                self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))
+                found += 1
+        return found
 
     def _take(self, found: OutlineSighting | Rejection) -> None:
         if isinstance(found, OutlineSighting):

@@ -17,9 +17,9 @@ from .surfaces import Associator, lay_on_surfaces
 class Pipeline:
     """Feeds one engine with what the front ends see, and looks for pipes where the engine expects them."""
 
-    def __init__(self, rig: Rig, associate: Associator = lay_on_surfaces) -> None:
+    def __init__(self, rig: Rig, associate: Associator = lay_on_surfaces, together: int = 1) -> None:
         self.rig = rig
-        self.engine = Engine(rig, {}, associate)
+        self.engine = Engine(rig, {}, associate, together=together)
         self._outlines = OutlineSearch(self.engine)
         self._depths = DepthSearch(self.engine)
         self._base = BaseSearch(self.engine)

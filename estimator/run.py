@@ -15,7 +15,7 @@ from .result import Result
 from .summary import Summary
 from .surfaces import Associator
 
-SETTLE_ROUNDS = 10
+SETTLE_ROUNDS = 3
 
 
 def finish(

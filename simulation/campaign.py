@@ -11,6 +11,7 @@ import yaml
 
 from ..estimator.executor import Executor, Outcome
 from ..factors.errors import SurecutError
+from .campaign_pixels import LOG
 from .campaign_row import Row, failed_row
 from .campaign_run import Level, RunOrder, run
 from .measurement_level_scenario import load_scenarios
@@ -48,7 +49,8 @@ def open_campaign(
     sensitivity: bool = False,
     recordings: Path | None = None,
 ) -> Campaign:
-    """A campaign from a scenario file or the name of one that comes with surecut.
+    """A campaign from a scenario file or the name of one that comes with surecut; images also from a folder of
+    simulated recordings.
 
     Raises:
         SurecutError: there is no such scenario, or something in it is wrong.
@@ -56,7 +58,7 @@ def open_campaign(
     if recordings is not None:
         recordings.mkdir(parents=True, exist_ok=True)
     if level == "pixels":
-        found = tuple(scenario.model_dump(mode="json") for scenario in load_pixel_scenarios(source))
+        found = _recorded(Path(source)) if Path(source).is_dir() else _rendered(source)
     else:
         path = Path(source) if Path(source).suffix in (".yaml", ".yml") else SCENARIOS / f"{source}.yaml"
         if not path.exists():
@@ -64,6 +66,18 @@ def open_campaign(
             raise SurecutError(f"{source}: no such scenario; give a YAML file or one of {names}")
         found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(path))
     return Campaign(level, found, leave_out, decisions, sensitivity, recordings)
+
+
+def _rendered(source: str) -> tuple[Mapping[str, Any], ...]:
+    return tuple(scenario.model_dump(mode="json") for scenario in load_pixel_scenarios(source))
+
+
+def _recorded(folder: Path) -> tuple[Mapping[str, Any], ...]:
+    """Simulated recordings that are there already: they carry their truth."""
+    logs = sorted(folder.glob("*.mcap"))
+    if not logs:
+        raise SurecutError(f"{folder}: holds no recordings (*.mcap)")
+    return tuple({"name": log.stem, LOG: str(log.resolve())} for log in logs)
 
 
 def run_campaign(

@@ -23,15 +23,19 @@ from .scenario import Scenario
 
 POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
 POINTS = "/truth/points"
+LOG = "log"
+"""Key of a scenario that is a recording already: its path."""
 
 
 def run_pixels(number: int, scenario: Mapping[str, Any], recordings: Path | None = None) -> Row:
-    """Renders with the run's number as seed.
+    """Renders with the run's number as seed, or takes a recording that is there.
 
     Args:
         recordings: folder that keeps the recordings; one that is there already is not rendered again.
             Without it they are gone afterwards.
     """
+    if LOG in scenario:
+        return row_of_log(number, str(scenario["name"]), Path(scenario[LOG]))
     wanted = Scenario.model_validate(dict(scenario))
     if recordings is None:
         with TemporaryDirectory(prefix="surecut-campaign-") as folder:

@@ -261,3 +261,13 @@ def test_what_is_left_out_and_what_inputs_do_is_in_table_and_page():
     page = report_html("s", table, rows)
     assert "Without one family" in page
     assert "baseline by 1 mm" in page
+
+
+def test_a_folder_of_recordings_is_a_scenario(tmp_path):
+    for name in ("b", "a"):
+        (tmp_path / f"{name}.mcap").touch()
+    campaign = open_campaign(str(tmp_path), "pixels")
+    assert [campaign.order(i).scenario["name"] for i in (0, 1, 2)] == ["a", "b", "a"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SurecutError, match="holds no recordings"):
+        open_campaign(str(tmp_path / "empty"), "pixels")

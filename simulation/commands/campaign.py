@@ -27,7 +27,12 @@ def command(
         Path, typer.Option("-o", "--output", help="Folder of the runs and tables; resumed if it is one.")
     ],
     runs: Annotated[int, typer.Option(min=1, help="Number of runs; run i has seed i.")] = 50,
-    scenario: Annotated[str, typer.Option(help="Scenario file (YAML), or the name of one that comes along.")] = "cell",
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="Scenario file (YAML), or the name of one; with `--level pixels` also a folder of recordings."
+        ),
+    ] = "cell",
     level: Annotated[
         Literal["measurements", "pixels"],
         typer.Option(help="Draw the measurements, or render images."),
