@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..factors.errors import SurecutError
@@ -179,7 +180,7 @@ def _decode(hint: Any, data: Any, where: str, shape: tuple[int, ...] | None) -> 
     if origin in (typing.Union, types.UnionType):
         rest = [a for a in arguments if a is not types.NoneType]
         return None if data is None else _decode(rest[0], data, where, shape)
-    if origin is np.ndarray:
+    if origin in (np.ndarray, NDArray):  # NumPy 2.5 keeps its alias's name
         return _decode_array(data, where, shape)
     if origin is tuple:
         return tuple(_decode(arguments[0], item, f"{where}[{i}].", shape) for i, item in enumerate(_list(data, where)))
