@@ -1,9 +1,8 @@
 """The graph while it grows: what is believed, what waits for the solver, and the solver."""
 
-import gtsam
-
 from collections.abc import Sequence
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,14 +6,20 @@ import cv2
 import numpy as np
 import pytest
 from board_scene import BASELINE_M, STEP_NS, board_before, page, pair, right_of
+from scipy.stats import chi2
 
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
+from surecut.estimator.optimise import optimise
 from surecut.estimator.run import finish
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors.rig import Marker, Rig
 from surecut.frontends.fiducials.detector import MarkerFrontEnd
+from surecut.simulation.campaign_pixels import truth_of_log
 from surecut.simulation.marker_images import Photography, project, render_board
+from surecut.simulation.recording import simulate
+from surecut.simulation.scenario import Scenario
+from surecut.simulation.session import stamp_ns
 
 pytestmark = pytest.mark.campaign
 
@@ -21,6 +27,15 @@ START_NS = 1_000_000_000
 FRAMES = 20
 """Four seconds at 5 Hz."""
 PAGE_M = (0.210, 0.297)
+KNOCKED = {
+    "name": "knocked",
+    "place": "B",
+    "duration_s": 20,
+    "return_to_board": False,
+    "mobile": {"rate_hz": 5},
+    "kinect": {"rate_hz": 0.2, "width": 160, "height": 120, "depth_focal_px": 146.25, "rgb_focal_px": 131.25},
+    "board": {"knock": {"at_s": 2.0}},
+}
 BOARD_EVENTS = {
     "side_length_wrong", "print_scale_wrong", "markers_swapped", "marker_duplicated", "marker_loose", "board_knocked",
     "corner_inset", "ambiguous_start",
@@ -174,3 +189,20 @@ def test_marker_that_came_loose(shift_m):
 
 def test_the_pair_is_the_scenes():
     assert right_of(board_before(1.0))[0, 3] == pytest.approx(-BASELINE_M)
+
+
+def test_board_that_is_knocked_in_the_cell(tmp_path):
+    """With tracks: without anything but boards nobody could say what has moved."""
+    log = tmp_path / "knocked.mcap"
+    simulate(log, Scenario.model_validate(KNOCKED), 3)
+    result, truth = optimise(log), truth_of_log(log)
+    event = told(result, "board_knocked")
+    assert event.values["before_ns"] < stamp_ns(KNOCKED["board"]["knock"]["at_s"]) <= event.stamp_ns
+    assert abs(event.values["moved_m"] - np.hypot(0.02, 0.01)) < 3 * event.values["moved_sigma_m"] < 0.003
+    assert abs(event.values["turned_rad"] - 0.06) < 3 * event.values["turned_sigma_rad"] < 0.02
+    assert "mount (f_T_b) holds for the time before only" in event.text
+    assert result.consistency.passed, result.consistency.reasons
+    assert result.points
+    for point in result.points:
+        error = point.position_m - truth.points_b_m[point.id]
+        assert error @ np.linalg.solve(point.covariance_m2, error) < chi2.isf(0.0027, 3)
