@@ -115,8 +115,12 @@ class Boards:
         return chi2_isf(self._rig.gates.gate_probability, 6)
 
     def can_start(self, sightings: Sequence[MarkerSighting]) -> bool:
-        """Would a board get its first pose from these sightings of one frame alone?"""
-        for sheet, seen in self._by_sheet(sightings):
+        """Would a board get its first pose from these sightings of one frame alone?
+
+        Not from an image whose ids may be exchanged, until another one has said the same: hence the inspection.
+        """
+        for sheet, raw in self._by_sheet(sightings):
+            seen = self.inspection.trusted(sheet, raw)
             enough = min(2, len(sheet.board.markers))
             for camera in {s.camera for s in seen}:
                 mine = [s for s in seen if s.camera == camera]

@@ -10,7 +10,7 @@ from ..factors.measurements import MarkerSighting
 from ..factors.noise import gaussian, robust
 from ..factors.projection import machine_projection, mobile_projection
 from ..factors.rig import Rig
-from ..frontends.board_fit import corner_covariance
+from ..frontends.board_fit import corner_covariance, independent_common_px
 from .board_inspection import FAMILY
 from .board_news import GEOMETRY, BoardNews
 from .board_start import inset_sigma_px
@@ -104,7 +104,7 @@ class CornerFactors:
             self._news.refuse(sheet, [sighting], "one more view from the same place, views", cells.views, STILL_VIEWS)
             return None
         least = self._rig.noise.marker_common_px
-        common = max(least, sighting.common_px or 0.0)
+        common = max(least, independent_common_px(sighting))
         total = corner_covariance(sighting, least)
         on_page = min(LASTING * common**2 / float(np.einsum("kii->k", total).mean() / 2), 1.0 - LEAST_OWN_SHARE)
         return added_covariance((1.0 - on_page) * total, float(np.sqrt(1.0 - LASTING)) * common, cells.views)

@@ -35,6 +35,9 @@ class MarkerSighting:
     common_px: float | None = None
     """Sigma of the part of it that views from the same place have in common, where the front end knows; the rig's
     `marker_common_px` is the least."""
+    independent_scale: float = 1.0
+    """Factor on the covariances of corners that are used as if their errors were independent of each other; below 1
+    where the marker as a whole is known better than such corners say."""
     gross: tuple[int, ...] = ()
     """Corners that contradict the rest of their board: they are not used."""
 

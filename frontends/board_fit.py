@@ -85,15 +85,20 @@ def board_corners(sightings: Sequence[MarkerSighting], board: Board, common_px: 
 
 
 def corner_covariance(sighting: MarkerSighting, common_px: float) -> Float:
-    """Covariance of the four corners in one image, (4, 2, 2).
+    """Covariance of the four corners in one image, as if they were independent of each other, (4, 2, 2).
 
     Args:
         common_px: least sigma of what views from the same place have in common; what the sighting itself says of it
             counts where it is more.
     """
-    own = np.asarray(sighting.covariance_px2, float)
-    said = sighting.common_px or 0.0
+    own = sighting.independent_scale * np.asarray(sighting.covariance_px2, float)
+    said = independent_common_px(sighting)
     return own + max(common_px**2 - said**2, 0.0) * np.eye(2)
+
+
+def independent_common_px(sighting: MarkerSighting) -> float:
+    """Sigma of the part of `corner_covariance` that views from the same place share, as the sighting says it."""
+    return float(np.sqrt(sighting.independent_scale)) * (sighting.common_px or 0.0)
 
 
 def fit_board(

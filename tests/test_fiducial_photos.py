@@ -60,8 +60,9 @@ def test_golden_corners_of_opencv(name):
     inset = np.mean([np.sum(d * outward(given[k]), axis=1) for k, d in apart.items()])
     assert 0.2 < inset < 1.0
     rest = np.concatenate([d - inset * outward(given[k]) for k, d in apart.items()])
-    # the grid is drawn with hard pixel edges and acute corners, which a contour cuts off further
-    assert np.abs(rest).max() < (1.8 if name == "gboriginal.png" else 1.2)
+    # the grid was made smaller by leaving pixels out, and sharpened: its edges are stairs, and a contour's whole pixels
+    # end on the last stair, up to a pixel from where the edges cross. Ours say 0.2 to 0.3 px for themselves there.
+    assert np.abs(rest).max() < (1.7 if name == "gboriginal.png" else 1.1)
     assert np.mean(np.abs(rest) < 1.0) > (0.95 if name == "gboriginal.png" else 0.98)
     assert np.sqrt((rest**2).mean()) < 0.5
 
@@ -91,7 +92,8 @@ def test_halves_of_the_pixels_agree_within_their_covariances(monkeypatch):
             apart, covariance = one.corners_px - other.corners_px, one.covariance_px2 + other.covariance_px2
             squares.append(np.einsum("ki,kij,kj->k", apart, np.linalg.inv(covariance), apart).mean() / 2)
     assert len(squares) > 75
-    assert 0.15 < np.mean(squares) < 1.0
+    # 0.36 +/- 0.03 by the scatter between markers: below a quarter, edges' errors would be far overstated
+    assert 0.25 < np.mean(squares) < 0.6
 
 
 def test_ubiquity_corners_and_reference_pose():

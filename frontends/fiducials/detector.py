@@ -12,6 +12,7 @@ from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort, undistorted_grid
 from .board_layout import predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
+from .independent_corners import independent_scale
 from .pattern_fit import PatternFit, Warm, fit_patterns
 from .search import Candidate, MarkerSearch
 from .tracking import Followed, MarkerFlow
@@ -214,16 +215,18 @@ class MarkerFrontEnd:
         return good, refused
 
     def _sighting(self, stamp_ns: int, fitted: _Fitted) -> MarkerSighting:
-        blocks = np.stack([fitted.covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
+        covariance = fitted.covariance + CORNER_FLOOR_PX**2 * np.eye(8)
+        blocks = np.stack([covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
         return MarkerSighting(
             stamp_ns,
             self._name,
             self._boards[fitted.candidate.key].id,
             fitted.candidate.marker,
             fitted.corners,
-            blocks + CORNER_FLOOR_PX**2 * np.eye(2),
+            blocks,
             distort(self._camera, fitted.corners),
             float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2)),
+            independent_scale(covariance, fitted.corners),
         )
 
     def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:
