@@ -1,6 +1,7 @@
 """Where a recording's bytes come from: a file, the files of a rosbag2 folder, a URL, a pipe."""
 
 import contextlib
+import importlib
 import importlib.util
 import re
 from collections.abc import Iterator
@@ -156,7 +157,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 def _url(url: str) -> BinaryIO:
     if importlib.util.find_spec("fsspec") is None:
         raise LogError(f"{url}: reading URLs needs the package fsspec; install it, or copy the log here")
-    import fsspec  # pyright: ignore[reportMissingImports]  # optional
+    fsspec = importlib.import_module("fsspec")  # optional
 
     try:
         return fsspec.open(url, "rb").open()
