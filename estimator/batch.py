@@ -1,5 +1,6 @@
 """The refinement after the run: everything relinearised at once, outliers told apart, then solved again."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
@@ -12,7 +13,7 @@ from ..factors.noise import robust_scale
 from .graph import FactorLog, Record
 from .linear import deviate
 from .linearised import Linearised, linearise, with_correlated_tracks
-from .observability import determined
+from .observability import Undetermined, determined
 from .odometry import FAMILY as ODOMETRY
 
 Float = NDArray[np.float64]
@@ -26,6 +27,10 @@ SNOOPING_SIGMA = 3.7
 SNOOPING_ROUNDS = 8
 MINIMUM_VIEWS = 2
 """Pixels that a landmark needs to be a point."""
+
+
+Finder = Callable[[Linearised], list[tuple[int, Rejection]]]
+"""A test for outliers: places in the log, and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +48,13 @@ class BatchSolution:
 
 def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
     """Robust Levenberg-Marquardt; then what is beyond noise is taken out, first by its residual, then by snooping."""
-    first, iterations = optimum(log.graph(), start)
     off: set[int] = set()
     rejected: list[Rejection] = []
+    first, iterations = optimum(log.graph(), start)
     at = linearise(log, off, first, robust_sigma)
     for finder, rounds in ((outliers, 3), (snooped, SNOOPING_ROUNDS)):
         for _ in range(rounds):
-            found = finder(at)
+            found = _told_by(finder, at)
             if not found:
                 break
             off |= {i for i, _ in found}
@@ -74,6 +79,18 @@ def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gts
     with determined():
         values = optimiser.optimize()
     return values, optimiser.iterations()
+
+
+def _told_by(finder: Finder, at: Linearised) -> list[tuple[int, Rejection]]:
+    """What a test finds; where a landmark is undetermined, so that there is no test, all of that landmark's factors."""
+    try:
+        return finder(at)
+    except Undetermined as error:
+        if keys.kind(error.key) != "l":
+            raise
+        reason = "undetermined where its matches put it; views"
+        touching = [at.active[p] for p in at.system.touching([error.key])[0]]
+        return [(i, Rejection(r.stamp_ns, r.family, r.what, reason, 0.0, 1.0)) for i, _, r in touching]
 
 
 def without_factors(log: FactorLog, off: set[int]) -> gtsam.NonlinearFactorGraph:

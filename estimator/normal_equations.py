@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 
 from ..factors import keys
 from ..factors.errors import ObservabilityError
-from .observability import not_observable
+from .observability import Undetermined, not_observable
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -91,7 +91,7 @@ class NormalEquations:
             blocks = np.asarray(H[i.ravel(), j.ravel()]).reshape(-1, w, w)
             singular = np.linalg.eigvalsh(blocks)[:, 0] <= 1e-14 * np.trace(blocks, axis1=1, axis2=2)
             if singular.any():
-                raise ObservabilityError(not_observable(int(owner[at[np.argmax(singular), 0]])))
+                raise Undetermined(int(owner[at[np.argmax(singular), 0]]))
             data.append(np.linalg.inv(blocks).ravel())
             rows.append(i.ravel())
             cols.append(j.ravel())
