@@ -283,6 +283,8 @@ class Stream:
             times = arrived, frame.taken_ns, frame.tracked_ns, now
             for part, began, ended in zip(self._parts.values(), times[:-1], times[1:], strict=True):
                 part.add(ended - began)
+        if frame.early:
+            return
         self._count("frames")
         self._count("lost_frames", int(frame.lost))
         self._count("tracking_cpu_us", round(1e6 * frame.cpu_s))

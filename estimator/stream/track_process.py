@@ -5,6 +5,8 @@ import traceback
 from typing import Any
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from ...factors.errors import SurecutError
 from ...factors.rig import Rig
@@ -16,6 +18,8 @@ from .parent import end_with_parent
 from .settings import StreamSettings
 from .thinning import Thinning
 from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
+
+Float = NDArray[np.float64]
 
 
 def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: Any, out: Any) -> None:
@@ -74,7 +78,7 @@ class TrackLoop:
         taken_ns, began = time.monotonic_ns(), time.process_time()
         frame, problem = None, None
         try:
-            frame = self._sensing.follow(items)
+            frame = self._sensing.follow(items, lambda motion, inliers: self._early(items, motion, inliers, taken_ns))
         except SurecutError as error:
             problem = " ".join(str(error).split())
         cpu_s = time.process_time() - began
@@ -87,6 +91,11 @@ class TrackLoop:
             items = [item for item in items if not isinstance(item, StereoPair)]  # it is told once
         if items:
             self._hand_on(Tracked(items, frame))
+
+    def _early(self, items: list[Item], motion: Float, inliers: int, taken_ns: int) -> None:
+        """A keyframe takes many times as long as its motion, on which the pose of the camera waits."""
+        stamp_ns = next(item.stamp_ns for item in items if isinstance(item, StereoPair))
+        self._out.put(Frame(stamp_ns, motion, False, False, inliers, taken_ns, time.monotonic_ns(), early=True))
 
     def _hand_on(self, tracked: Tracked) -> None:
         """To the other front ends. Where these are behind, frames and what is only about surfaces are left out: the

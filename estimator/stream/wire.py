@@ -42,7 +42,7 @@ class Tracked:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """From the tracking at once: how the mobile camera moved."""
+    """From the tracking: how the mobile camera moved."""
 
     stamp_ns: int
     last_T_this: Float
@@ -56,6 +56,8 @@ class Frame:
     """When it was done."""
     cpu_s: float = 0.0
     """Processor time that it took."""
+    early: bool = False
+    """By the flow alone, of a keyframe that is still in the making: it comes again, with the same stamp."""
 
 
 @dataclass(frozen=True, slots=True)
