@@ -20,7 +20,7 @@ from ..bundle import Bundle
 from ..items import Item, unreadable
 from ..sensing import Sensed, Sensing, images
 from ..sensors import PairImages
-from .parent import LOOK_NICE, end_with_parent, give_way
+from .parent import LOOK_NICE, end_with_parent, give_way, keep_loaded
 from .settings import StreamSettings
 from .thinning import Thinning
 from .wire import Died, LateClick, Order, Ready, Tracked, Worked
@@ -36,6 +36,7 @@ def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: A
         patient: the sources wait, so that no pose is late.
     """
     end_with_parent()
+    keep_loaded()
     if not patient:
         give_way(LOOK_NICE)
     cv2.setNumThreads(1)

@@ -23,6 +23,7 @@ from .children import NAMES, Children
 from .follower import Followed
 from .latency import Latencies
 from .ordering import LiveOrder
+from .parent import keep_loaded
 from .publisher import update_of
 from .remembered import remembered
 from .settings import StreamSettings
@@ -117,6 +118,7 @@ class Stream:
             for sink in self._sinks:
                 sink.start(self._commanded)
             self._start_children()
+            keep_loaded()
             for source in self._sources:
                 source.start(self._deliver_to(source))
             while not self._stopping.is_set():

@@ -14,7 +14,7 @@ from ...io.messages import CloudBody, DepthBody, ImageBody, Message
 from ...io.pairing import StereoPair
 from ..items import Item, unreadable
 from ..sensing import Sensing
-from .parent import end_with_parent
+from .parent import end_with_parent, keep_loaded
 from .settings import StreamSettings
 from .thinning import Thinning
 from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
@@ -29,6 +29,7 @@ def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: A
         patient: nothing may be left out, however long it takes.
     """
     end_with_parent()
+    keep_loaded()
     cv2.setNumThreads(1)
     try:
         loop = TrackLoop(rig, settings, patient, look, out)

@@ -109,6 +109,8 @@ class Answer:
     """`m` at that keyframe, `b`, and the boards."""
     points: tuple[PointEstimate, ...] = ()
     """In {b}, with the covariance of the moment of the last look at a board."""
+    joint_m2: Float | None = None
+    """Shape (3 n, 3 n), of all n points together, in their order."""
     pipes: tuple[PipeEstimate, ...] = ()
     decisions: tuple[Decision, ...] = ()
     """Of the cut plan, as if asked at the last look at a board."""
