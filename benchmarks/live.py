@@ -15,7 +15,6 @@ import resource
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -26,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer
+from stream_process import free_port, lines, started
 from websockets.sync.client import connect
 
 from surecut.estimator.items import wanted_topics
@@ -174,27 +174,22 @@ def follow(port: int, seen: Seen, stop: threading.Event) -> None:
     """Reads the lines as an inverse kinematics program does."""
     told, newest_ns = "", 0
     while not stop.is_set():
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1) as connection, connection.makefile() as lines:
-                connection.settimeout(5)
-                for line in lines:
-                    now, update = time.monotonic(), json.loads(line)
-                    if "m" in update["poses"]:
-                        seen.came.setdefault(update["stamp_ns"], now)
-                    places = json.dumps([p["position_m"] for p in update["points"]])
-                    if update["points"] and update["points_covariance_m2"] is not None:
-                        if update["points_stamp_ns"] > newest_ns:
-                            seen.answers.append(now)
-                        if places != told:
-                            seen.moved.append(now)
-                        newest_ns = update["points_stamp_ns"]
-                        seen.behind_s.append(1e-9 * (update["stamp_ns"] - newest_ns))
-                    told = places
-                    seen.faults |= {fault["name"] for fault in update["health"]["faults"]}
-                    if stop.is_set():
-                        return
-        except (OSError, ValueError):
-            time.sleep(0.05)
+        for update in lines(port, 1e6):
+            now = time.monotonic()
+            if "m" in update["poses"]:
+                seen.came.setdefault(update["stamp_ns"], now)
+            places = json.dumps([p["position_m"] for p in update["points"]])
+            if update["points"] and update["points_covariance_m2"] is not None:
+                if update["points_stamp_ns"] > newest_ns:
+                    seen.answers.append(now)
+                if places != told:
+                    seen.moved.append(now)
+                newest_ns = update["points_stamp_ns"]
+                seen.behind_s.append(1e-9 * (update["stamp_ns"] - newest_ns))
+            told = places
+            seen.faults |= {fault["name"] for fault in update["health"]["faults"]}
+            if stop.is_set():
+                return
 
 
 def stalled_viewer(port: int, stop: threading.Event) -> None:
@@ -204,12 +199,6 @@ def stalled_viewer(port: int, stop: threading.Event) -> None:
         wanted = [{"id": n, "channelId": n} for n in range(1, 20)]
         viewer.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
         stop.wait()
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def small_disk() -> None:
@@ -232,12 +221,7 @@ def measured(log: Path, seconds: float, faults: bool, kinect_hz: float) -> tuple
         if faults:
             flood = serve_once(Flood(log, rig, Seen(), stop))
             options += ["--mcap", f"tcp://127.0.0.1:{flood}", "--zenoh-out", f"tcp/127.0.0.1:{free_port()}"]
-        script = "from surecut.estimator.cli import main; main()"
-        process = subprocess.Popen(
-            [sys.executable, "-c", script, "stream", *map(str, options)],
-            stderr=subprocess.DEVNULL,
-            preexec_fn=small_disk if faults else None,
-        )
+        process = started(*options, stderr=subprocess.DEVNULL, preexec_fn=small_disk if faults else None)
         try:
             threading.Thread(target=follow, args=(tcp, seen, stop), daemon=True).start()
             while not seen.came:

@@ -79,8 +79,9 @@ class OutlineSearch:
         if not self._ahead:
             for pipe in list(self._engine.pipes.cylinders):
                 axis = self._engine.pipes.axis(pipe)
-                for camera in MOBILE if axis is not None else ():
-                    self._choose(pipe, axis, camera)
+                if axis is not None:
+                    for camera in MOBILE:
+                        self._choose(pipe, axis, camera)
         self.go_on()
 
     def go_on(self, to_the_end: bool = False) -> None:

@@ -1,10 +1,9 @@
 """The tracking's process: it does nothing that a pose has to wait for but the pose."""
 
 import time
-import traceback
+from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +13,10 @@ from ...io.messages import CloudBody, DepthBody, ImageBody, Message
 from ...io.pairing import StereoPair
 from ..items import Item, unreadable
 from ..sensing import Sensing
-from .parent import end_with_parent, keep_loaded
+from .serving import serve
 from .settings import StreamSettings
 from .thinning import Thinning
-from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
+from .wire import Frame, Group, Tracked, Worked
 
 Float = NDArray[np.float64]
 
@@ -28,24 +27,7 @@ def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: A
     Args:
         patient: nothing may be left out, however long it takes.
     """
-    end_with_parent()
-    keep_loaded()
-    cv2.setNumThreads(1)
-    try:
-        loop = TrackLoop(rig, settings, patient, look, out)
-        out.put(Ready("tracking"))
-        while True:
-            item = inbox.get()
-            if isinstance(item, Group):
-                loop.take(item.items)
-            elif isinstance(item, Order):
-                look.put(item)
-                if item.what == "finish":
-                    return
-                if item.what == "reset":
-                    loop = TrackLoop(rig, settings, patient, look, out, loop.calibrations)
-    except Exception:
-        out.put(Died("tracking", traceback.format_exc()))
+    serve("tracking", 0, lambda known: TrackLoop(rig, settings, patient, look, out, known), inbox, look, out)
 
 
 class TrackLoop:
@@ -62,17 +44,18 @@ class TrackLoop:
         patient: bool,
         look: Any,
         out: Any,
-        calibrations: dict[str, Message] | None = None,
+        calibrations: Mapping[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
         self._thinning = Thinning(look, settings, patient)
         self._look = look
         self._out = out
-        self.calibrations = calibrations or {}
+        self.calibrations = dict(calibrations or {})
         self._sensing.calibrate([*self.calibrations.values()])
 
-    def take(self, items: list[Item]) -> None:
-        """A group. A pair that cannot be used is told, and the stream goes on."""
+    def take(self, group: Group) -> None:
+        """A pair that cannot be used is told, and the stream goes on."""
+        items: list[Item] = group.items
         for item in items:
             if self._sensing.is_calibration(item):
                 self.calibrations[item.topic] = item
