@@ -95,7 +95,8 @@ class Sensing:
         """
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
-        return self.sensors.track(pair) if pair is not None else None
+        clicked = any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
+        return self.sensors.track(pair, clicked) if pair is not None else None
 
     def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
         """Everything else that a group shows.

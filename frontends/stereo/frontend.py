@@ -74,13 +74,16 @@ class StereoFrontEnd:
         """Shape (4, 4): the last keyframe's pose in the front end's own chain, corrected where places come back."""
         return self._chain_T_keyframe.copy()
 
-    def process(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> StereoFrame:
+    def process(
+        self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic], wanted: bool = False
+    ) -> StereoFrame:
         """Tracks the features into this pair.
 
         Args:
             stamp_ns: time of the pair, later than that of the pair before.
             left: image (h, w) or (h, w, 3), 8 bit.
             right: the same size.
+            wanted: its place matters, so it becomes a keyframe; plain flow drifts, alike for all features.
         """
         pair = prepare(stamp_ns, left, right)
         if self._last is None:
@@ -93,7 +96,7 @@ class StereoFrontEnd:
         if motion is None:
             return self._recover(pair, guess)
         pose = motion.reference_T_this
-        if self._wants_keyframe(left_px, pose) is None:
+        if not wanted and self._wants_keyframe(left_px, pose) is None:
             return self._plain_frame(pair, left_px, motion)
         return self._keyframe(pair, pose) or self._recover(pair, pose)
 
