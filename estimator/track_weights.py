@@ -22,7 +22,8 @@ FEWEST_TRACKS = 40
 """Tracks that tell how much their variances differ."""
 WIDTHS = (1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 25.0, 60.0)
 """Degrees of freedom of the distribution of variances that are tried: from tracks of all kinds to tracks all alike."""
-ALIKE = 60.0
+ALIKE = 0.5
+"""Where variances differ little and no track has a smaller weight, all keep theirs."""
 SCALES = np.exp(np.linspace(-0.5, 0.7, 25))
 """Typical variances that are tried, about the median of what the tracks show."""
 MOST = 1.5
@@ -51,9 +52,9 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int
         chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
         spread = spread or spread_of_variances(chi2, dof)
         width, scale = spread
-        if width >= ALIKE:
-            return {}
         weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
+        if width == WIDTHS[-1] and weight.min() > ALIKE:
+            return {}
     return {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}
 
 
