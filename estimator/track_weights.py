@@ -7,6 +7,8 @@ track count as the others foretell them (Baarda 1968), and its variance is drawn
 whose width this log's tracks tell: errors with a multivariate t distribution (Lange, Little and Taylor 1989).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
@@ -35,8 +37,20 @@ Views = list[tuple[int, Int]]
 """Landmark, and the positions of its factors in the system."""
 
 
-def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int, float]:
-    """Information of each track over what it states, by the positions of its factors. Empty: the tracks are alike.
+@dataclass(frozen=True, slots=True)
+class TrackWeights:
+    by_position: dict[int, float]
+    """Information over what is stated, by the positions of factors; empty where tracks are alike."""
+    slack: float = 1.0
+    """Standard deviations of the estimate over those that weights known beforehand would give."""
+
+
+def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWeights:
+    """How much the tracks of a family are worth.
+
+    The weights come from the residuals themselves. A track that is more wrong gets less weight, so that the estimate
+    follows a small error by less than the weighted normal equations say: with w degrees of freedom of the variances and
+    d of the track by `(w + d) / (w + d + 2)`, on average (Lange, Little and Taylor 1989, section 5).
 
     Args:
         active: all factors of a system.
@@ -45,17 +59,21 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int
     """
     tracks = _views(active, family)
     if len(tracks) < FEWEST_TRACKS:
-        return {}
+        return TrackWeights({})
     weight = np.ones(len(tracks))
     spread: tuple[float, float] | None = None
+    dof = weight
     for _ in range(ROUNDS):
         chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
         spread = spread or spread_of_variances(chi2, dof)
         width, scale = spread
         weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
         if width == WIDTHS[-1] and weight.min() > ALIKE:
-            return {}
-    return {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}
+            return TrackWeights({})
+    slack = float(((spread[0] + dof + 2.0) / (spread[0] + dof) * dof).sum() / dof.sum()) if spread else 1.0
+    return TrackWeights(
+        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack
+    )
 
 
 def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> LinearSystem:

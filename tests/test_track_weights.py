@@ -54,7 +54,7 @@ def scene(wander_px, seed=0):
 def weights_of(log, values):
     """By track."""
     at = linearise(log, set(), values, ROBUST)
-    found = track_weights(at.active, at.system, FAMILY)
+    found = track_weights(at.active, at.system, FAMILY).by_position
     return {at.active[p][2].what.split(" in ")[0]: w for p, w in found.items()}
 
 
