@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.special import gammaln
 
 from ..factors import keys
@@ -30,6 +31,10 @@ SCALES = np.exp(np.linspace(-0.5, 0.7, 25))
 """Typical variances that are tried, about the median of what the tracks show."""
 MOST = 1.5
 """A track counts for so much more than stated at most: few residuals may be small by chance."""
+LANDMARK = 3
+"""Coordinates of a point."""
+LIGHT = 0.03
+"""Share of a track's squared residual that its own pull on the estimate makes, up to which first order is enough."""
 ROUNDS = 2
 """A heavy track's residuals grow when it is no longer followed."""
 
@@ -114,33 +119,46 @@ def _views(active: Active, family: str) -> Views:
 def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Float]:
     """Squared residuals (n,) of whole tracks in units of their covariance, and their degrees of freedom (n,).
 
-    Any place of the landmark would do, and what the track itself does to the estimate is taken out.
+    Any place of the landmark would do, and what the track itself does to the estimate is taken out. At the solution
+    the residuals of a track are orthogonal to its landmark, and to first order in its leverage H the square is
+    `r^T (1 + H) r`; only tracks for which that matters are looked at closely.
     """
     place, covariance = system.rest_covariance()
-    found = np.array([_residual(p, system.columns[key], system, place, covariance) for key, p in tracks])
-    return found[:, 0], np.maximum(found[:, 1], 1e-3)
+    rows = [_rows(system, positions) for _, positions in tracks]
+    chi2 = np.array([float(system.b[r] @ system.b[r]) for r in rows])
+    dof = np.array([max(len(r) - LANDMARK, 1e-3) for r in rows])
+    if covariance is None:
+        return chi2, dof
+    followed = _followed(rows, system, place, covariance)
+    for i in np.flatnonzero(followed > LIGHT * chi2):
+        chi2[i], dof[i] = _residual(rows[i], system.columns[tracks[i][0]], system, place, covariance)
+        followed[i] = 0.0
+    return chi2 + followed, dof
 
 
-def _residual(
-    positions: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float | None
-) -> tuple[float, float]:
+def _followed(rows: list[Int], system: LinearSystem, place: Int, covariance: Float) -> Float:
+    """`r^T H r` of every track, shape (n,)."""
+    every = np.concatenate(rows)
+    owner = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    pull = csr_matrix((system.b[every], (owner, np.arange(len(every)))), shape=(len(rows), len(every)))
+    drawn = np.asarray((pull @ system.A[every])[:, np.flatnonzero(place >= 0)].todense())
+    return ((drawn @ covariance) * drawn).sum(axis=1)
+
+
+def _residual(rows: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float) -> tuple[float, float]:
     """`z^T (I - H)^-1 z` of what is left of the residuals when the landmark is eliminated, and its dimension."""
-    rows = _rows(system, positions)
     part = system.A[rows]
     columns = np.unique(part.indices)
     dense = np.zeros((len(rows), len(columns)))
     dense[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), np.searchsorted(columns, part.indices)] = part.data
     own = (columns >= landmark.start) & (columns < landmark.stop)
     free = np.linalg.qr(dense[:, own], mode="complete")[0][:, int(own.sum()) :].T
-    z = free @ system.b[rows]
-    if covariance is None:
-        return float(z @ z), float(len(z))
-    at, B = place[columns[~own]], free @ dense[:, ~own]
+    z, B, at = free @ system.b[rows], free @ dense[:, ~own], place[columns[~own]]
     hat = B @ covariance[np.ix_(at, at)] @ B.T
     eigenvalues, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
     known = eigenvalues > DETERMINED
     along = (vectors.T @ z)[known]
-    return float((along**2 / eigenvalues[known]).sum()), float(known.sum())
+    return float((along**2 / eigenvalues[known]).sum()), max(float(known.sum()), 1e-3)
 
 
 def _rows(system: LinearSystem, positions: Int) -> Int:

@@ -1,4 +1,4 @@
-"""A stereo pair that is 2 % and 0.3 px off what its calibration says costs the pipe points little; see `-m campaign`."""
+"""A stereo pair that is 2 % and 0.3 px off its calibration costs the pipe points little; see `-m campaign`."""
 
 import numpy as np
 import pytest
