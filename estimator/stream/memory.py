@@ -20,7 +20,7 @@ from ...factors.camera import CameraModel
 from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
 from ...io.reader import LogReader
-from ..batch import BatchSolution, without_factors
+from ..batch import BatchSolution
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
@@ -72,7 +72,7 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     log, values = engine.solver.log, engine.state.values
     graph = log.graph()
     if solution is not None:
-        values, graph = solution.values, without_factors(log, set(solution.outliers))
+        values, graph = solution.values, solution.at.graph()
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
