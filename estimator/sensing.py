@@ -99,7 +99,8 @@ class Sensing:
         """
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
-        return self.sensors.track(pair, early) if pair is not None else None
+        clicked = any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
+        return self.sensors.track(pair, clicked, early) if pair is not None else None
 
     def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
         """Everything else that a group shows.

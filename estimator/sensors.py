@@ -90,14 +90,19 @@ class Sensors:
 
     # Stereo ---------------------------------------------------------------------------------------------------
 
-    def track(self, pair: PairImages, early: Early | None = None) -> StereoFrame:
-        """Feature tracks of a pair; `early` is told of a keyframe's motion before it is done."""
+    def track(self, pair: PairImages, wanted: bool = False, early: Early | None = None) -> StereoFrame:
+        """Feature tracks of a pair.
+
+        Args:
+            wanted: it becomes a keyframe.
+            early: told of a keyframe's motion before it is done.
+        """
         if self._stereo is None:
             left, right = self._camera("m_left"), self._camera("m_right")
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
             self._stereo = StereoFrontEnd(left, right, self.left_T_right())
-        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right, early)
+        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right, wanted, early)
         if self._unmatched < UNMATCHED_PAIRS:
             self._check_sides(pair, frame)
         return frame

@@ -79,7 +79,12 @@ class StereoFrontEnd:
         return self._chain_T_keyframe.copy()
 
     def process(
-        self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic], early: Early | None = None
+        self,
+        stamp_ns: int,
+        left: NDArray[np.generic],
+        right: NDArray[np.generic],
+        wanted: bool = False,
+        early: Early | None = None,
     ) -> StereoFrame:
         """Tracks the features into this pair.
 
@@ -87,6 +92,7 @@ class StereoFrontEnd:
             stamp_ns: time of the pair, later than that of the pair before.
             left: image (h, w) or (h, w, 3), 8 bit.
             right: the same size.
+            wanted: its place matters, so it becomes a keyframe; plain flow drifts, alike for all features.
             early: told of a keyframe's motion before the work on it begins, which takes ten times as long.
         """
         pair = prepare(stamp_ns, left, right)
@@ -100,7 +106,7 @@ class StereoFrontEnd:
         if motion is None:
             return self._recover(pair, guess)
         pose = motion.reference_T_this
-        if self._wants_keyframe(left_px, pose) is None:
+        if not wanted and self._wants_keyframe(left_px, pose) is None:
             return self._plain_frame(pair, left_px, motion)
         if early is not None:
             early(inverse(self._keyframe_T_last) @ pose, int(motion.inliers.sum()))
