@@ -207,8 +207,8 @@ class GraphLoop:
         """The audit's outcome, when it is there."""
         try:
             found = self._auditing.taken()
-        except ObservabilityError:
-            self.counts["undetermined"] += 1
+        except SurecutError:
+            self.counts["audits_failed"] += 1
             return
         if found is not None:
             self._audit, self._changed = found, True
