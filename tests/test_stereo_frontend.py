@@ -51,6 +51,17 @@ def run(pairs, noise=2.0, gain=1.0, seed=0, front=None):
     ]
 
 
+def test_a_pair_whose_place_matters_is_a_keyframe(rendered):
+    _, pairs = rendered
+    front, rng = front_end(), np.random.default_rng(5)
+    frames = [
+        front.process((i + 1) * STEP_NS, expose(left, rng, 2.0, 1.0), expose(right, rng, 2.0, 1.0), wanted=i == 2)
+        for i, (left, right, _) in enumerate(pairs[:4])
+    ]
+    assert [frame.is_keyframe for frame in frames] == [True, False, True, False]
+    assert np.isfinite(frames[2].right_px[:, 0]).sum() > 30
+
+
 def chained(frames):
     poses = [np.eye(4)]
     for frame in frames[1:]:
