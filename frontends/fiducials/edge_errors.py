@@ -53,7 +53,7 @@ def edge_errors(
         inverse: of its normal matrix, shape (m, k, k).
         residual: shape (m, n), of the fit.
         weight: shape (m, n).
-        shifts: change of the grey values by a shift of each grid line, pixels, of constant a and of b, shape (m, 2, l, n).
+        shifts: change of the grey values by a shift of each grid line of constant a, then of b, shape (m, 2, l, n).
         place: (a - 1/2, b - 1/2) of each pixel in the marker, shape (m, 2, n).
     """
     m, _, lines, n = shifts.shape

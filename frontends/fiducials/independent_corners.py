@@ -28,7 +28,9 @@ def independent_scale(covariance: Float, corners: Float) -> Float:
     """
     J = _affine(corners)
     apart = covariance * _OWN
-    of_both = J.swapaxes(-1, -2)[..., None, :, :] @ np.linalg.solve(np.stack([apart, covariance], -3), J[..., None, :, :])
+    of_both = J.swapaxes(-1, -2)[..., None, :, :] @ np.linalg.solve(
+        np.stack([apart, covariance], -3), J[..., None, :, :]
+    )
     logarithm = np.linalg.slogdet(of_both)[1]
     return np.exp((logarithm[..., 0] - logarithm[..., 1]) / 6.0)
 

@@ -360,9 +360,7 @@ def _summary(state: _State, solved: _Settled, pixels: Pixels, noise: Float) -> P
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
-    edges = edge_errors(
-        solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place
-    )
+    edges = edge_errors(solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place)
     last_step = np.abs(solved.step[:, :8]).max(1)
     by_noise = solved.inverse[:, :8, :8] * edges.noise_variance[:, None, None]
     covariance = by_noise + edges.variance_px2 * edges.spread
