@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,31 @@ PART_M = 0.1
 """A pipe is taken to go on so far beyond its picks."""
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """One picture in which a pipe's outline is to be looked for."""
+
+    pipe: str
+    camera: str
+    pair: PairImages
+    prior: OutlinePrior
+
+
 class OutlineSearch:
     """Keeps pictures, and looks for pipes in them where the engine's estimate says that they are."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, views_at_once: int | None = None) -> None:
+        """
+        Args:
+            views_at_once: views of known pipes that one call looks at, at most; the rest is for `go_on`, so that nobody
+                has to wait long. None for all.
+        """
         self._engine = engine
+        self._at_once = views_at_once
+        self._ahead: deque[_View] = deque()
+        """Views that have been chosen and not looked at."""
+        self._found: list[OutlineSighting | Rejection] = []
+        """In those before them. They enter together, as if there had been no wait."""
         self._finders: dict[str, OutlineFinder] = {}
         self._kept: deque[PairImages] = deque()
         self._kept_bytes = 0
@@ -55,12 +76,27 @@ class OutlineSearch:
             self._about(pick, pair)
         if clicked:
             self._engine.flush()
-        found = 0
-        for pipe in list(self._engine.pipes.cylinders):
-            axis = self._engine.pipes.axis(pipe)
-            if axis is not None:
-                found += sum(self._where_predicted(pipe, axis, camera) for camera in MOBILE)
-        if found:
+        if not self._ahead:
+            for pipe in list(self._engine.pipes.cylinders):
+                axis = self._engine.pipes.axis(pipe)
+                if axis is not None:
+                    for camera in MOBILE:
+                        self._choose(pipe, axis, camera)
+        self.go_on()
+
+    def go_on(self, to_the_end: bool = False) -> None:
+        """Looks at views that are chosen; where there are none, nothing happens."""
+        number = len(self._ahead)
+        if self._at_once is not None and not to_the_end:
+            number = min(number, self._at_once)
+        for _ in range(number):
+            view = self._ahead.popleft()
+            finder = self._finder(view.camera)
+            self._found.append(finder.find(view.pair.stamp_ns, view.pipe, view.pair.of(view.camera), view.prior))
+        if self._found and not self._ahead:
+            for found in self._found:
+                self._take(found)
+            self._found.clear()
             self._engine.flush()
 
     def _about(self, pick: Pick, pair: PairImages) -> None:
@@ -74,12 +110,11 @@ class OutlineSearch:
             looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
             looked[pair.stamp_ns] = where.o_T_c.translation()
 
-    def _where_predicted(self, pipe: str, axis: tuple[Float, Float, float], camera: str) -> int:
-        """Looks for a known pipe's outline in views that differ from those already used; in how many."""
+    def _choose(self, pipe: str, axis: tuple[Float, Float, float], camera: str) -> None:
+        """Views for a known pipe's outline that differ from those already used."""
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
         passed = self._passed.setdefault(f"{pipe} {camera}", set())
         ends = _part_of_axis(self._engine.pipes.places(pipe), axis)
-        found = 0
         for pair in [kept for kept in self._kept if kept.stamp_ns not in looked and kept.stamp_ns not in passed]:
             if len(looked) >= OUTLINE_VIEWS:
                 break
@@ -94,9 +129,7 @@ class OutlineSearch:
             prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
             if prior is not None:
                 looked[pair.stamp_ns] = place
-                self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))
-                found += 1
-        return found
+                self._ahead.append(_View(pipe, camera, pair, prior))
 
     def _take(self, found: OutlineSighting | Rejection) -> None:
         if isinstance(found, OutlineSighting):
