@@ -10,7 +10,7 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, MarkerSighting, Rejection
 from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort, undistorted_grid
-from .board_layout import predict_missing
+from .board_layout import DOUBLED, IN_PLACE, apart_on_page, predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
 from .independent_corners import independent_scale
 from .pattern_fit import PatternFit, Warm, fit_patterns
@@ -240,14 +240,15 @@ class MarkerFrontEnd:
                 continue
             expected = predict_missing(self._boards, single).get(key)
             size = np.linalg.norm(distinct[0].corners[2] - distinct[0].corners[0])
+            off = [np.inf if expected is None else float(np.abs(f.corners - expected).max()) for f in distinct]
+            fits = [f for f, o in zip(distinct, off, strict=True) if o < IN_PLACE * size]
+            good += fits
+            side = self._boards[key].side_m
             for f in distinct:
-                off = np.inf if expected is None else float(np.abs(f.corners - expected).max())
-                if off < 0.25 * size:
-                    good.append(f)
-                else:
-                    refused.append(
-                        _refused(f, "stands in the image more than once, number of places", len(distinct), 1)
-                    )
+                if not any(f is g for g in fits):
+                    from_others = [g for g in fits or distinct if g is not f]
+                    apart = min(apart_on_page(g.corners, f.corners, side) for g in from_others)
+                    refused.append(_refused(f, f"{DOUBLED}, m from the other place", apart, IN_PLACE * side))
         return good, refused
 
     def _sightings(self, stamp_ns: int, good: list[_Fitted]) -> list[MarkerSighting]:
