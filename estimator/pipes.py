@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.measurements import OutlineSighting, Pick, Rejection
-from ..factors.noise import gaussian, robust, sigmas
+from ..factors.noise import floored, gaussian, robust, sigmas
 from ..factors.pipe import (
     axis_gauge,
     inset_prior,
@@ -162,7 +162,7 @@ class Pipes:
         return where.o_T_c.translation(), direction / np.linalg.norm(direction)
 
     def _observe(self, point: _Point, where: SeenFrom, pick: Pick, update: Update) -> None:
-        covariance = pick.covariance_px2 + np.eye(2) * self._rig.noise.pick_floor_px**2
+        covariance = floored(pick.covariance_px2, self._rig.noise.pick_floor_px)
         model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
         key = keys.point(point.index)
         if pick.camera == "b_rgb":
