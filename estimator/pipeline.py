@@ -56,6 +56,7 @@ class Pipeline:
     def complete(self) -> None:
         """What waited for something else gets its last chance."""
         self.engine.revisit()
+        self._outlines.complete()
         if self._base.search(self._depths.view, last=True):
             self.engine.revisit()
         self._depths.search()

@@ -40,7 +40,7 @@ from .result import (
 from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
 
 Float = NDArray[np.float64]
-LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "picks")
+LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "pipe width", "picks")
 """Families without each of which there may still be an estimate to compare with."""
 
 

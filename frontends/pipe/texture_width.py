@@ -36,6 +36,9 @@ _INDEPENDENT, _MOST = 6.0, 3.0
 """As in `surface`: independent bits of texture along a strip, and what one strip may say at most."""
 _SHARE = 0.4
 """Neighbouring strips, and the two images of a pair, show the same texture."""
+_MOST_AGAINST = 0.05
+"""Share of what all strips say that may speak against the width: beside a wrong axis it is 0.05 to 0.25, beside the
+right one 0.01 to 0.05; where it is more, nothing is measured."""
 _PIXEL_SIGMA = 1 / np.sqrt(12.0)
 
 
@@ -101,10 +104,24 @@ def width_by_texture(views: Sequence[PipeView]) -> TextureWidth | None:
     by_radius, by_offset = share.sum(axis=0), share.sum(axis=1)
     mean = float(by_radius @ radii)
     spread = float(np.sqrt(by_radius @ (radii - mean) ** 2))
-    if not radii[1] < mean < radii[-2] or spread > 2 * pixel:
+    offset = by_offset @ offsets
+    at_border = by_offset @ (np.abs(offsets) > AXIS_M - 0.75 * pixel).any(axis=1)
+    if not radii[1] < mean < radii[-2] or spread > 2 * pixel or at_border > 0.05:
         return None
-    sigma = float(np.hypot(spread, _PIXEL_SIGMA * pixel))
-    return TextureWidth(mean, sigma, (by_offset @ offsets) @ across, len(strips))
+    width = TextureWidth(mean, float(np.hypot(spread, _PIXEL_SIGMA * pixel)), offset @ across, len(strips))
+    return width if _against(strips, borders, width) < _MOST_AGAINST else None
+
+
+def _against(strips: Sequence[_Strips], borders: Float, width: TextureWidth) -> float:
+    """Share of what the strips say, in absolute terms, that speaks against a width."""
+    against = total = 0.0
+    for one in strips:
+        middle = float(width.offset_m @ one.across_o)
+        inside = np.abs(0.5 * (borders[1:] + borders[:-1]) - middle) < width.radius_m - one.blurred_m
+        gain = np.diff(one.total)
+        against += float(np.maximum(np.where(inside, -gain, gain), 0.0).sum())
+        total += float(np.abs(gain).sum())
+    return against / max(total, 1e-9)
 
 
 def _borders(views: Sequence[PipeView]) -> Float:
@@ -167,17 +184,17 @@ def _cut(view: PipeView, middles: Float) -> tuple[Float, Float, float] | None:
         return None
     line = line[inside][: int(inside.sum()) // each * each]
     sight = line[len(line) // 2]
-    across = np.cross(way / length, sight)
+    across = np.asarray(np.cross(way / length, sight), np.float64)
     across /= np.linalg.norm(across)
     grid = line[:, None, :] + middles[:, None] * across
     ideal = grid @ K.T
     raw = distort(view.camera, ideal[..., :2] / ideal[..., 2:])
     grey = sampled(view.image.astype(np.float32), raw).astype(float)
-    return grey.reshape(-1, each, len(middles)).mean(axis=1), across, float(sight[2]) / view.camera.fx
+    return grey.reshape(-1, each, len(middles)).mean(axis=1), across, float(sight[2] / view.camera.fx)
 
 
 def _across(axis: Float) -> Float:
     """Two unit directions across an axis, shape (2, 3)."""
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(axis, first)])
+    return np.asarray(np.stack([first, np.cross(axis, first)]), np.float64)
