@@ -56,28 +56,28 @@ class OutlineSearch:
                 self._about(pick, pair)
         if clicked:
             self._engine.flush()
-        self._look(last=False)
+        self._look(anew=bool(clicked))
 
     def complete(self) -> None:
         """No more pictures will come."""
-        self._look(last=True)
+        self._look(anew=True)
 
-    def _look(self, last: bool) -> None:
+    def _look(self, anew: bool) -> None:
         """All that the kept pictures tell of pipes now."""
         pipes, found = self._engine.pipes, 0
         for pipe in pipes.named():
             ends = pipes.known_part(pipe)
             if ends is None:
                 continue
-            self._measure_width(pipe, ends, last)
+            self._measure_width(pipe, ends, anew)
             found += sum(self._where_predicted(pipe, camera) for camera in MOBILE)
             self._widths.enter(pipe)
         if found:
             self._engine.flush()
 
-    def _measure_width(self, pipe: str, ends: tuple[Float, Float], last: bool) -> None:
+    def _measure_width(self, pipe: str, ends: tuple[Float, Float], anew: bool) -> None:
         views = [KeptView(pair, camera) for camera in MOBILE for pair in self._differing(pipe, camera, ends)]
-        if self._widths.measure(pipe, ends, views, last):
+        if self._widths.measure(pipe, ends, views, anew):
             # What was found without knowing the width is looked for again.
             stamps = {pair.stamp_ns for pair in self._kept}
             self._widths.forget_outlines(pipe, stamps)

@@ -42,18 +42,18 @@ class PipeWidths:
         """The width as it is known now."""
         return self._found.get(pipe)
 
-    def measure(self, pipe: str, ends: tuple[Float, Float], kept: Sequence[KeptView], last: bool = False) -> bool:
+    def measure(self, pipe: str, ends: tuple[Float, Float], kept: Sequence[KeptView], anew: bool) -> bool:
         """Measures a pipe's width if there are enough new views.
 
         Args:
             ends: of the part of its axis to look at, {o}.
-            last: no more views will come.
+            anew: measure with the same views too: the axis is known better.
 
         Returns:
             True where it has become known just now: edges that were found without it want another look.
         """
         before = self._views.get(pipe, 0)
-        if len(kept) < max(FEWEST_VIEWS, before + 1 if last else MORE_VIEWS * before):
+        if len(kept) < max(FEWEST_VIEWS, 0.0 if anew else MORE_VIEWS * before):
             return False
         self._views[pipe] = len(kept)
         found = width_by_texture([view for one in kept if (view := self._view(one, ends)) is not None])

@@ -377,9 +377,9 @@ class Pipes:
 
     def take_back(self, pipe_id: str, stamps: set[int]) -> None:
         """Outlines that leave the graph again."""
-        gone = [pair for pair in self.outlined_of(pipe_id) if pair[1].stamp_ns in stamps]
-        self.outlined = [pair for pair in self.outlined if not any(pair is other for other in gone)]
-        self.cylinders[pipe_id].outlines -= len(gone)
+        before = len(self.outlined)
+        self.outlined = [p for p in self.outlined if not (p[1].pipe_id == pipe_id and p[1].stamp_ns in stamps)]
+        self.cylinders[pipe_id].outlines -= before - len(self.outlined)
 
     def named(self) -> list[str]:
         """Pipes that something is known of."""

@@ -26,8 +26,9 @@ THINNEST_M = 0.008
 FEWEST_VIEWS = 4
 AXIS_M = 0.012
 """How far the axis may be off what was expected."""
-USUAL_BLUR_PX = 0.6
-"""Of lens and pixel together, see `limb_model`: a strip nearer to the edge than this holds both sides."""
+USUAL_BLUR_PX = float(np.hypot(0.6, 1 / np.sqrt(6.0)))
+"""Of lens and pixel together (0.6, see `limb_model`), and of the linear interpolation between pixels (its kernel is a
+triangle of variance 1/6): a strip nearer to the edge than this holds both sides."""
 _STRIP_PX, _BIN_PX = 0.5, 3.0
 _FEWEST_BINS = 6
 _LEAST_CONTRAST = 2.0
@@ -36,9 +37,14 @@ _INDEPENDENT, _MOST = 6.0, 3.0
 """As in `surface`: independent bits of texture along a strip, and what one strip may say at most."""
 _SHARE = 0.4
 """Neighbouring strips, and the two images of a pair, show the same texture."""
-_MOST_AGAINST = 0.05
-"""Share of what all strips say that may speak against the width: beside a wrong axis it is 0.05 to 0.25, beside the
-right one 0.01 to 0.05; where it is more, nothing is measured."""
+_AGAINST, _AGAINST_INSIDE, _AGAINST_BESIDE, _BESIDE_M = 0.05, 0.07, 0.18, 0.02
+"""Share of what all strips say that may speak against the width; or, where another quiet thing such as a second pipe is
+in view, of those on the pipe and of those just beside it. On rendered recordings it is 0.01 to 0.05 about the right
+axis, and 0.05 to 0.25 about axes that are 5 to 40 degrees or 50 to 150 mm off; on the pipe 0.02 to 0.1, and 0.08 to
+0.25; just beside it 0.02 to 0.07, with a second pipe 0.17, and 0.19 to 0.32. Where it is more, nothing is said."""
+_NEAR_BORDER = 0.8
+"""An axis so far off may be still farther off. Along the line of sight views from one side leave it open: its mean
+stays in the middle then."""
 _PIXEL_SIGMA = 1 / np.sqrt(12.0)
 
 
@@ -77,6 +83,8 @@ class _Strips:
     blurred_m: float
     """How far inside the edge strips begin to look like the background."""
     pixel_m: float
+    distance_m: float
+    """Of the axis from the camera."""
 
 
 def width_by_texture(views: Sequence[PipeView]) -> TextureWidth | None:
@@ -94,7 +102,7 @@ def width_by_texture(views: Sequence[PipeView]) -> TextureWidth | None:
     score = np.zeros((len(offsets), len(radii)))
     for one in strips:
         middle = (offsets @ (across @ one.across_o))[:, None]
-        inner = np.maximum(radii - one.blurred_m, 0.0)
+        inner = np.maximum(_visible(radii, one.distance_m) - one.blurred_m, 0.0)
         high = np.interp((middle + inner).ravel(), borders, one.total)
         low = np.interp((middle - inner).ravel(), borders, one.total)
         score += (high - low).reshape(score.shape)
@@ -105,23 +113,31 @@ def width_by_texture(views: Sequence[PipeView]) -> TextureWidth | None:
     mean = float(by_radius @ radii)
     spread = float(np.sqrt(by_radius @ (radii - mean) ** 2))
     offset = by_offset @ offsets
-    at_border = by_offset @ (np.abs(offsets) > AXIS_M - 0.75 * pixel).any(axis=1)
-    if not radii[1] < mean < radii[-2] or spread > 2 * pixel or at_border > 0.05:
+    if not radii[1] < mean < radii[-2] or spread > 2 * pixel or np.abs(offset).max() > _NEAR_BORDER * AXIS_M:
         return None
     width = TextureWidth(mean, float(np.hypot(spread, _PIXEL_SIGMA * pixel)), offset @ across, len(strips))
-    return width if _against(strips, borders, width) < _MOST_AGAINST else None
+    return width if _agreed(strips, borders, width) else None
 
 
-def _against(strips: Sequence[_Strips], borders: Float, width: TextureWidth) -> float:
-    """Share of what the strips say, in absolute terms, that speaks against a width."""
-    against = total = 0.0
+def _visible(radius_m: Float, distance_m: float) -> Float:
+    """Half the width that a cylinder covers of the plane through its axis: its outline touches it nearer by."""
+    return radius_m / np.sqrt(1.0 - np.minimum(radius_m / distance_m, 0.9) ** 2)
+
+
+def _agreed(strips: Sequence[_Strips], borders: Float, width: TextureWidth) -> bool:
+    """Do nearly all strips agree: those on the pipe that it is there, and those beside it that it is not?"""
+    place = 0.5 * (borders[1:] + borders[:-1])
+    for_it, against = np.zeros(3), np.zeros(3)
     for one in strips:
-        middle = float(width.offset_m @ one.across_o)
-        inside = np.abs(0.5 * (borders[1:] + borders[:-1]) - middle) < width.radius_m - one.blurred_m
-        gain = np.diff(one.total)
-        against += float(np.maximum(np.where(inside, -gain, gain), 0.0).sum())
-        total += float(np.abs(gain).sum())
-    return against / max(total, 1e-9)
+        beyond = np.abs(place - float(width.offset_m @ one.across_o)) + one.blurred_m
+        beyond -= float(_visible(np.array(width.radius_m), one.distance_m))
+        gain, inside, beside = np.diff(one.total), beyond < 0, (beyond >= 0) & (beyond < _BESIDE_M)
+        all_of_it = np.where(inside, gain, -gain)
+        said = np.array([all_of_it, all_of_it * inside, all_of_it * beside])
+        for_it += np.maximum(said, 0.0).sum(axis=1)
+        against += np.maximum(-said, 0.0).sum(axis=1)
+    share = against / np.maximum(for_it + against, 1e-9)
+    return bool(share[0] < _AGAINST or (share[1] < _AGAINST_INSIDE and share[2] < _AGAINST_BESIDE))
 
 
 def _borders(views: Sequence[PipeView]) -> Float:
@@ -156,7 +172,11 @@ def _strips(view: PipeView, borders: Float) -> _Strips | None:
     blurred = float(-ndtri(share)) * USUAL_BLUR_PX * pixel
     # Strips are as wide as a fraction of a pixel in the middle view: weigh them by their width in this one.
     width = (borders[1] - borders[0]) / pixel
-    return _Strips(np.concatenate(([0.0], np.cumsum(gain * width))), view.o_R_c @ across, blurred, pixel)
+    axis_m = 0.5 * (view.point_a_m + view.point_b_m)
+    distance = float(np.linalg.norm(np.cross(axis_m, view.point_b_m - view.point_a_m)))
+    distance /= float(np.linalg.norm(view.point_b_m - view.point_a_m))
+    total = np.concatenate(([0.0], np.cumsum(gain * width)))
+    return _Strips(total, view.o_R_c @ across, blurred, pixel, distance)
 
 
 def _cut(view: PipeView, middles: Float) -> tuple[Float, Float, float] | None:
