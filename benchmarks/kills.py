@@ -8,18 +8,16 @@ truth (where the recording carries it), and how much of the recording is lost. S
 """
 
 import argparse
-import json
 import random
 import signal
-import socket
 import subprocess
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from stream_process import free_port, lines, started
 
 from surecut.io.messages import PointsBody
 from surecut.io.reader import LogReader
@@ -58,55 +56,15 @@ class Life:
     points: dict = field(default_factory=dict)
 
 
-def started(log: Path, memory: Path, record: Path, port: int) -> subprocess.Popen[bytes]:
-    options = [
-        "--replay",
-        log,
-        "--rate",
-        "1",
-        "--loop",
-        "1000",
-        "--tcp",
-        port,
-        "--checkpoint",
-        memory,
-        "--record",
-        record,
-    ]
-    script = "from surecut.estimator.cli import main; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", script, "stream", *map(str, options)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-
-def lines(port: int, seconds: float):  # noqa: ANN201
-    """Updates as they come, for so long."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1) as connection:
-                connection.settimeout(2)
-                with connection.makefile("rb") as file:
-                    for line in file:
-                        yield json.loads(line)
-                        if time.monotonic() > until:
-                            return
-        except (OSError, json.JSONDecodeError):
-            time.sleep(0.02)
+def streaming(log: Path, memory: Path, record: Path, port: int) -> "subprocess.Popen[bytes]":
+    options = ["--replay", log, "--rate", 1, "--loop", 1000, "--tcp", port, "--checkpoint", memory, "--record", record]
+    return started(*options, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def points_of(update: dict) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return {
         p["id"]: (np.array(p["position_m"]), np.sqrt(np.diag(np.array(p["covariance_m2"])))) for p in update["points"]
     }
-
-
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def difference(before: dict, after: dict) -> float:
@@ -162,7 +120,7 @@ def kills(log: Path, number: int, seed: int) -> list[Kill]:
         memory, before = Path(folder) / "memory.json", {}
         for i in range(number + 1):
             port, record = free_port(), Path(folder) / f"{i}.mcap"
-            process = started(log, memory, record, port)
+            process = streaming(log, memory, record, port)
             try:
                 life = lived(port, memory, truth, draw.uniform(0.0, 8.0), before)
             finally:

@@ -15,7 +15,6 @@ import resource
 import socket
 import struct
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -26,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer
+from stream_process import free_port, lines, started
 from websockets.sync.client import connect
 
 from surecut.estimator.items import wanted_topics
@@ -50,8 +50,12 @@ class Seen:
     """Stamp of a pair to the moment at which its later image was sent."""
     came: dict[int, float] = field(default_factory=dict)
     """Stamp to the first line with the camera's pose at it."""
-    points: list[tuple[float, bytes]] = field(default_factory=list)
-    """When a line had another covariance of the points than the one before."""
+    answers: list[float] = field(default_factory=list)
+    """When a line had points, with their joint covariance, of more measurements than the one before."""
+    moved: list[float] = field(default_factory=list)
+    """When a line had other points than the one before."""
+    behind_s: list[float] = field(default_factory=list)
+    """At each line with points: the time of the line's pose less that of the newest measurement in the points."""
     faults: set[str] = field(default_factory=set)
 
 
@@ -71,30 +75,50 @@ def serve_once(send: "Sender") -> int:
 class Sender:
     """A recording in real time, again and again, under stamps that go on."""
 
-    def __init__(self, log: Path, rig: Rig, seen: Seen, stop: threading.Event) -> None:
+    def __init__(self, log: Path, rig: Rig, seen: Seen, stop: threading.Event, depths: int = 1) -> None:
+        """
+        Args:
+            depths: how often each depth image is sent, under stamps evenly between its own and the next one's.
+        """
         self._log, self._rig, self._seen, self._stop = log, rig, seen, stop
         self._images = {rig.cameras.m_left.image_topic, rig.cameras.m_right.image_topic}
+        self._depths = depths
 
     def entries(self) -> Iterator[tuple[ChannelInfo, int, bytes]]:
         """With times and stamps shifted to now."""
-        shift, wanted = 0, wanted_topics(self._rig)
+        shift, wanted, left = 0, wanted_topics(self._rig), self._rig.cameras.m_left.image_topic
         while True:
-            first = last = 0
+            first = last = before = 0
             with LogReader(self._log) as reader:
                 for channel, at_ns, data in reader.raw():
                     if channel.topic in wanted:
                         first = first or at_ns
                         shift = shift or time.time_ns() - at_ns
-                        last = at_ns
+                        if channel.topic == left:
+                            before, last = last, at_ns
                         yield channel, at_ns + shift, restamped(bytes(data), shift)
-            shift += last - first + 100_000_000
+            shift += last + max(last - before, 0) - first  # the next picture comes when it would
+
+    def with_more_depth(self) -> Iterator[tuple[ChannelInfo, int, bytes]]:
+        """The entries, and depth images again."""
+        topic, period_ns = self._rig.cameras.b_depth.image_topic, depth_period_ns(self._log, self._rig)
+        waiting: list[tuple[int, ChannelInfo, bytes]] = []
+        for channel, at_ns, data in self.entries():
+            while waiting and waiting[0][0] <= at_ns:
+                due_ns, kind, again = waiting.pop(0)
+                yield kind, due_ns, again
+            yield channel, at_ns, data
+            if channel.topic == topic:
+                for number in range(1, self._depths):
+                    later_ns = number * period_ns // self._depths
+                    waiting.append((at_ns + later_ns, channel, restamped(data, later_ns)))
 
     def to(self, connection: socket.socket) -> None:
         out = connection.makefile("wb")
         writer = Writer(out, use_chunking=False)
         writer.start()
         channels: dict[ChannelInfo, int] = {}
-        for channel, at_ns, data in self.entries():
+        for channel, at_ns, data in self.with_more_depth():
             if self._stop.is_set():
                 return
             if channel not in channels:
@@ -108,6 +132,13 @@ class Sender:
                 return
             if channel.topic in self._images:
                 self._seen.sent[stamp_of(data)] = time.monotonic()
+
+
+def depth_period_ns(log: Path, rig: Rig) -> int:
+    """Of a recording's depth images; 0 where there are no two."""
+    with LogReader(log) as reader:
+        times = [at_ns for channel, at_ns, _ in reader.raw() if channel.topic == rig.cameras.b_depth.image_topic]
+    return int(np.median(np.diff(times))) if len(times) > 1 else 0
 
 
 class Flood(Sender):
@@ -141,24 +172,24 @@ def stamp_of(data: bytes) -> int:
 
 def follow(port: int, seen: Seen, stop: threading.Event) -> None:
     """Reads the lines as an inverse kinematics program does."""
-    last = b""
+    told, newest_ns = "", 0
     while not stop.is_set():
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1) as connection, connection.makefile() as lines:
-                connection.settimeout(5)
-                for line in lines:
-                    now, update = time.monotonic(), json.loads(line)
-                    if "m" in update["poses"]:
-                        seen.came.setdefault(update["stamp_ns"], now)
-                    told = json.dumps([p["position_m"] for p in update["points"]]).encode()
-                    if update["points"] and told != last:
-                        seen.points.append((now, told))
-                    last = told
-                    seen.faults |= {fault["name"] for fault in update["health"]["faults"]}
-                    if stop.is_set():
-                        return
-        except (OSError, ValueError):
-            time.sleep(0.05)
+        for update in lines(port, 1e6):
+            now = time.monotonic()
+            if "m" in update["poses"]:
+                seen.came.setdefault(update["stamp_ns"], now)
+            places = json.dumps([p["position_m"] for p in update["points"]])
+            if update["points"] and update["points_covariance_m2"] is not None:
+                if update["points_stamp_ns"] > newest_ns:
+                    seen.answers.append(now)
+                if places != told:
+                    seen.moved.append(now)
+                newest_ns = update["points_stamp_ns"]
+                seen.behind_s.append(1e-9 * (update["stamp_ns"] - newest_ns))
+            told = places
+            seen.faults |= {fault["name"] for fault in update["health"]["faults"]}
+            if stop.is_set():
+                return
 
 
 def stalled_viewer(port: int, stop: threading.Event) -> None:
@@ -170,18 +201,12 @@ def stalled_viewer(port: int, stop: threading.Event) -> None:
         stop.wait()
 
 
-def free_port() -> int:
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
 def small_disk() -> None:
     """As if there were no more room."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (DISK_BYTES, DISK_BYTES))
 
 
-def measured(log: Path, seconds: float, faults: bool) -> tuple[Seen, dict[str, float]]:
+def measured(log: Path, seconds: float, faults: bool, kinect_hz: float) -> tuple[Seen, dict[str, float]]:
     with LogReader(log) as reader:
         rig = rig_of(reader, None)
     seen, stop = Seen(), threading.Event()
@@ -189,18 +214,14 @@ def measured(log: Path, seconds: float, faults: bool) -> tuple[Seen, dict[str, f
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "rig.yaml").write_text(dump_rig(rig))
-        port = serve_once(Sender(log, rig, seen, stop))
+        depths = max(1, round(kinect_hz * 1e-9 * depth_period_ns(log, rig)))
+        port = serve_once(Sender(log, rig, seen, stop, depths))
         options = ["--rig", folder / "rig.yaml", "--mcap", f"tcp://127.0.0.1:{port}", "--tcp", tcp, "--web", web]
         options += ["--view", view, "--record", folder / "r.mcap", "--checkpoint", folder / "memory.json"]
         if faults:
             flood = serve_once(Flood(log, rig, Seen(), stop))
             options += ["--mcap", f"tcp://127.0.0.1:{flood}", "--zenoh-out", f"tcp/127.0.0.1:{free_port()}"]
-        script = "from surecut.estimator.cli import main; main()"
-        process = subprocess.Popen(
-            [sys.executable, "-c", script, "stream", *map(str, options)],
-            stderr=subprocess.DEVNULL,
-            preexec_fn=small_disk if faults else None,
-        )
+        process = started(*options, stderr=subprocess.DEVNULL, preexec_fn=small_disk if faults else None)
         try:
             threading.Thread(target=follow, args=(tcp, seen, stop), daemon=True).start()
             while not seen.came:
@@ -226,13 +247,22 @@ def told(seen: Seen, counters: dict[str, float]) -> bool:
     pairs = [s for s, at in seen.sent.items() if begin <= at <= end - 0.5]
     late = np.array([1e3 * (seen.came[s] - seen.sent[s]) for s in pairs if s in seen.came])
     p50, p99, worst = np.percentile(late, 50), np.percentile(late, 99), late.max()
-    answers = [at for at, _ in seen.points if at >= begin]
+    answers = [at for at in seen.answers if at >= begin]
     rate = len(answers) / max(end - max(begin, min(answers, default=begin)), 1e-9)
+    moved = [at for at in seen.moved if at >= begin]
     print(
         f"{len(late)} of {len(pairs)} pairs have a pose; last byte to line: "
         f"p50 {p50:.1f} ms, p99 {p99:.1f}, worst {worst:.1f}"
     )
-    print(f"points in b with their covariance made anew {rate:.2f} times a second, longest gap {gap(answers):.1f} s")
+    print(
+        f"points in b with their joint covariance {rate:.2f} times a second, longest gap {gap(answers):.2f} s "
+        f"({len(moved)} of {len(answers)} with measurements that changed them, the others say that nothing has)"
+    )
+    if seen.behind_s:
+        print(
+            f"newest measurement in the points behind the pose: median {np.median(seen.behind_s):.2f} s, "
+            f"longest {max(seen.behind_s):.2f}"
+        )
     print("faults named:", ", ".join(sorted(seen.faults)) or "none")
     kept = ("drop", "malformed", "error", "lost", "wrong_type", "left_out", "restarts", "late", "outlier", "refused")
     print({k: int(v) for k, v in sorted(counters.items()) if v and any(word in k for word in kept)})
@@ -249,8 +279,9 @@ def main() -> None:
     parser.add_argument("log", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--faults", action="store_true")
+    parser.add_argument("--kinect-hz", type=float, default=10.0, help="depth images are repeated until so many come")
     given = parser.parse_args()
-    raise SystemExit(0 if told(*measured(given.log, given.seconds, given.faults)) else 1)
+    raise SystemExit(0 if told(*measured(given.log, given.seconds, given.faults, given.kinect_hz)) else 1)
 
 
 if __name__ == "__main__":

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from ..factors import keys
 from ..factors.measurements import Rejection
 from ..factors.noise import robust_scale
+from ..factors.projection import reweighed
 from .graph import FactorLog, Record
 from .linear import deviate
 from .linearised import Linearised, linearise, with_correlated_tracks
 from .observability import Undetermined, determined
 from .odometry import FAMILY as ODOMETRY
+from .track_weights import track_weights
 
 Float = NDArray[np.float64]
 
@@ -64,8 +66,23 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             values, more = optimum(without_factors(log, off), at.values)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
+    at, more = _with_track_weights(log, off, at, robust_sigma)
     at = with_correlated_tracks(at, ODOMETRY)
+    iterations += more
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
+
+
+def _with_track_weights(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[Linearised, int]:
+    """The optimum with tracks weighed by what they are worth, and the iterations to there."""
+    factors = {}
+    for position, weight in track_weights(at.active, at.system, ODOMETRY).items():
+        index, factor, record = at.active[position]
+        factors[index] = reweighed(factor, record.camera or "", weight, robust_sigma)
+    if not factors:
+        return at, 0
+    weighed = log.replaced(factors)
+    values, iterations = optimum(without_factors(weighed, off), at.values)
+    return linearise(weighed, off, values, robust_sigma), iterations
 
 
 def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:

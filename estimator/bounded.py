@@ -11,7 +11,7 @@ import gtsam
 
 from ..factors import keys
 from ..factors.measurements import Rejection
-from .batch import MINIMUM_VIEWS, outliers
+from .batch import MINIMUM_VIEWS, orphans, outliers
 from .engine import Engine
 from .incremental import Cut
 from .limits import Limits
@@ -32,26 +32,39 @@ class Bounded:
     refused: Counter[str] = field(default_factory=Counter)
     """All refused measurements whose words were dropped, by family."""
     rebuilt: int = 0
+    _next: int | None = None
+    """Keyframes before it leave next; their outliers are out already."""
 
     def tidy(self) -> bool:
-        """After each bundle; True when keyframes have left the graph."""
+        """After each bundle; True when keyframes have left the graph.
+
+        The work is done in two parts, at successive bundles: nobody has to wait for both.
+        """
         engine = self.engine
+        if self._next is not None:
+            first, self._next = self._next, None
+            engine.flush()
+            self._forget(first)
+            return True
         count = engine.odometry.last_keyframe + 1 - self.first
         if count <= self.limits.keyframes:
             return False
         engine.flush()
-        self._forget(engine.odometry.last_keyframe + 1 - self.limits.keyframes + self.limits.step)
-        return True
+        self._next = engine.odometry.last_keyframe + 1 - self.limits.keyframes + self.limits.step
+        self._without_outliers(self._poses(self._next))
+        return False
+
+    def _poses(self, first: int) -> set[int]:
+        """Keyframes before `first`, but for those on which something hangs that has not entered yet."""
+        held, state = self.engine.held_keyframes(), self.engine.state
+        return {k for i in range(self.first, first) if (k := keys.keyframe(i)) not in held and state.has(k)}
 
     def _forget(self, first: int) -> None:
-        """All keyframes before `first` leave, but those on which something hangs that has not entered yet."""
+        """All keyframes before `first` leave that can."""
         engine = self.engine
-        held = engine.held_keyframes()
-        state = engine.state
-        poses = {k for i in range(self.first, first) if (k := keys.keyframe(i)) not in held and state.has(k)}
+        poses = self._poses(first)
         if not poses:
             return
-        self._without_outliers(poses)
         landmarks = self._landmarks_of(poses)
         cut = self._reduced(Cut(poses | landmarks.gone, landmarks.lonely, landmarks.split))
         self.refused_landmarks(cut.dropped)
@@ -77,16 +90,21 @@ class Bounded:
                 cut = smaller
 
     def _without_outliers(self, poses: set[int]) -> None:
-        """What noise does not explain is not put into the prior, which nobody can take apart again."""
+        """What noise does not explain is not put into the prior, which nobody can take apart again; nor what is left
+        of landmarks that are no points without it."""
+        if not poses:
+            return
         engine = self.engine
         log = engine.solver.log
-        found = outliers(linearise(log, (), engine.solver.values(), engine.rig.gates.robust_sigma))
-        mine = [(i, told) for i, told in found if poses.intersection(log.factors[i].keys())]
+        at = linearise(log, (), engine.solver.values(), engine.rig.gates.robust_sigma)
+        mine = [(i, told) for i, told in outliers(at) if poses.intersection(log.factors[i].keys())]
+        mine += [(i, told) for i, told in orphans(at, {i for i, _ in mine}) if log.records[i].family != FAMILY]
         log.off.update(i for i, _ in mine)
         engine.rejected += [told for _, told in mine]
 
     def _landmarks_of(self, poses: set[int]) -> "_Landmarks":
-        """Landmarks that only these keyframes saw: those that go, and those without views enough to be points."""
+        """Landmarks that only these keyframes saw: those that go, and those without views enough to be points,
+        wherever these are."""
         inside: Counter[int] = Counter()
         outside: Counter[int] = Counter()
         every: set[int] = set()
@@ -103,7 +121,9 @@ class Bounded:
             if isinstance(factor, gtsam.CustomFactor):
                 bound.update(marks)
         seen = {k for k in every if not outside[k]}
-        lonely = {k for k in seen if inside[k] < MINIMUM_VIEWS}
+        lonely = {k for k in every - bound if inside[k] + outside[k] < MINIMUM_VIEWS}
+        lonely |= {k for k in seen if inside[k] < MINIMUM_VIEWS}
+        lonely |= {k for k in self.engine.state.values.keys() if keys.kind(k) == "l" and k not in every}
         views = self.engine.odometry.observations
         known = sorted(seen - lonely, key=lambda k: -views.get(keys.index(k), 0))
         both = [k for k in every - seen if inside[k] >= MINIMUM_VIEWS and k not in bound]

@@ -44,6 +44,8 @@ NEAR = (0.0, 0.07, 0.14, 0.28)
 """Distances of neighbours whose residuals are compared, likewise."""
 MOTIONS = 12
 """Motions over a second that are looked at."""
+PART = 0.6
+"""Size of a part of the scene whose tracks may be wrong together, as a share of their typical distance."""
 FEWEST_PAIRS = 300
 """Pairs of residuals, `LAGS` apart, that tell."""
 SEGMENT = 16
@@ -76,7 +78,7 @@ def correlate(active: Active, values: gtsam.Values, system: LinearSystem, family
     influence = _influence_on_motions(tracks, values, system)
     if influence is not None:
         effect = _design_effect(tracks, system, influence, found, neighbours)
-        effect *= _track_effect(tracks, system, influence, found * np.sqrt(effect))
+        effect *= _group_effect(tracks, values, system, influence, found * np.sqrt(effect))
     return Correlation(found * np.sqrt(effect), _inflation(tracks, own * effect))
 
 
@@ -103,22 +105,46 @@ def _design_effect(
     return 1.0 + float(np.median(shared / alone))
 
 
-def _track_effect(tracks: "Tracks", system: LinearSystem, influence: Float, found: csr_matrix) -> float:
-    """Variance of motions by what whole tracks contribute to them over what the errors' covariance says, at least one.
+def _group_effect(
+    tracks: "Tracks", values: gtsam.Values, system: LinearSystem, influence: Float, found: csr_matrix
+) -> float:
+    """Variance of motions by what whole groups of tracks contribute to them over what the errors' covariance says.
 
     What a track contributes is a sum over its views, whatever makes them alike, and however much tracks differ in how
-    wrong they are (cluster-robust variance; Liang and Zeger 1986). Residuals are smaller than errors: those of errors
-    that are drawn from the covariance tell by how much.
+    wrong they are; tracks of one part of the scene may be wrong together (cluster-robust variance; Liang and Zeger
+    1986). Residuals are smaller than errors: those of errors that are drawn from the covariance tell by how much. The
+    worse of the two accounts counts, and one at least.
     """
     errors = found @ np.random.default_rng(1).normal(size=(len(system.b), DRAWS))
     residuals = np.column_stack([system.b, errors - system.A @ system.solve(system.A.T @ errors)])
-    own, seen = tracks.gather(system, influence), tracks.gather(system, residuals)
-    squares = []
-    for one in np.moveaxis(seen, -1, 0):
-        whole = np.zeros((int(tracks.track.max()) + 1, influence.shape[1]))
-        np.add.at(whole, tracks.track, (own * one[..., None]).sum(axis=(1, 2)))
-        squares.append((whole**2).sum(axis=0))
-    return max(float(np.mean(squares[0] / np.mean(squares[1:], axis=0))), 1.0)
+    seen = tracks.gather(system, residuals)
+    own = (tracks.gather(system, influence)[:, :, :, None] * seen[..., None]).sum(axis=(1, 2))
+    whole = np.zeros((int(tracks.track.max()) + 1, *own.shape[1:]))
+    np.add.at(whole, tracks.track, own)
+    ratios = [_contributed(whole)]
+    ratios.append(float(np.mean([_contributed(_summed(whole, group)) for group in _parts(tracks, values)])))
+    return max(*ratios, 1.0)
+
+
+def _contributed(groups: Float) -> float:
+    """Squares of what groups contribute, shape (groups, 1 + draws, motions): the first over the mean of the draws."""
+    squares = (groups**2).sum(axis=0)
+    return float(np.mean(squares[0] / np.mean(squares[1:], axis=0)))
+
+
+def _summed(whole: Float, group: Int) -> Float:
+    total = np.zeros((int(group.max()) + 1, *whole.shape[1:]))
+    np.add.at(total, group, whole)
+    return total
+
+
+def _parts(tracks: "Tracks", values: gtsam.Values) -> list[Int]:
+    """Tracks (n,) by the part of the scene that they are in: cells of space, for two grids."""
+    points = np.array([values.atPoint3(landmark) for landmark in tracks.landmarks])
+    seen_from = np.array([values.atPose3(keyframe).translation() for keyframe in tracks.first_keyframes])
+    size = PART * float(np.median(np.linalg.norm(points - seen_from, axis=1)))
+    cells = [np.floor((points - points.min(axis=0)) / size + shift).astype(np.int64) for shift in (0.0, 0.5)]
+    return [np.unique(cell, axis=0, return_inverse=True)[1].ravel() for cell in cells]
 
 
 def root(tracks: "Tracks", system: LinearSystem, variances: Float) -> csr_matrix:
@@ -227,8 +253,12 @@ class Tracks:
         order = np.argsort(stamps, kind="stable")
         self.images = np.split(order, np.flatnonzero(np.diff(stamps[order])) + 1) if len(order) else []
         """Entries of one keyframe each, in the order of time."""
+        firsts = [active[self._factor[i].max()][1] for i in np.flatnonzero(self.place == 0)]
+        self.landmarks = [_key(factor, "l") for factor in firsts]
+        """By track."""
+        self.first_keyframes = [_key(factor, "x") for factor in firsts]
         self.stamps: list[int] = [int(stamps[i[0]]) for i in self.images]
-        self.keyframes = [_keyframe(active[self._factor[i[0]].max()][1]) for i in self.images]
+        self.keyframes = [_key(active[self._factor[i[0]].max()][1], "x") for i in self.images]
         px = self._pixels(active)
         diagonal = float(np.linalg.norm(np.ptp(px, axis=0))) if len(px) else 1.0
         self._apart = [np.linalg.norm(px[i][:, None] - px[i], axis=2) / diagonal for i in self.images]
@@ -237,7 +267,7 @@ class Tracks:
 
     def _pixels(self, active: Active) -> Float:
         """Shape (n, 2), in one of the two images."""
-        measured = [active[max(pair)][1].measured() for pair in self._factor]  # type: ignore[attr-defined]
+        measured = [active[max(pair)][1].measured() for pair in self._factor]
         return np.array(measured, dtype=np.float64).reshape(-1, 2)
 
     def rows(self, system: LinearSystem, camera: int) -> Int:
@@ -307,5 +337,5 @@ class Tracks:
         return np.broadcast_to(errors, (len(self.track), 2, 2, count))
 
 
-def _keyframe(factor: gtsam.NonlinearFactor) -> int:
-    return next(key for key in factor.keys() if keys.kind(key) == "x")
+def _key(factor: gtsam.NonlinearFactor, kind: str) -> int:
+    return next(key for key in factor.keys() if keys.kind(key) == kind)

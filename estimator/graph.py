@@ -1,6 +1,6 @@
 """The currency between sensors and solvers: factors with their provenance, and first guesses of new variables."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -90,6 +90,13 @@ class FactorLog:
         """Another factor in the place of one that says the same, or a part of it."""
         self.factors[index] = factor
         self._off_graph = -1
+
+    def replaced(self, factors: Mapping[int, gtsam.NonlinearFactor]) -> "FactorLog":
+        """A log of its own, with other factors in the place of some."""
+        other = FactorLog()
+        other.factors = [factors.get(index, factor) for index, factor in enumerate(self.factors)]
+        other.records, other.off = self.records, self.off
+        return other
 
     def active(self) -> Iterator[tuple[int, gtsam.NonlinearFactor, Record]]:
         for index, (factor, record) in enumerate(zip(self.factors, self.records, strict=True)):

@@ -1,6 +1,7 @@
 """The linearised problem as one sparse system: covariances of anything, and what each factor contributes."""
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -8,7 +9,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, identity, vstack
+from scipy.sparse import csc_matrix, csr_matrix, diags, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -111,6 +112,25 @@ class LinearSystem:
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
         return self._normal.solve(right)
+
+    def rest_covariance(self) -> tuple[NDArray[np.int64], Float | None]:
+        """Place (n,) of every unknown among those that are no landmark, -1 for landmarks, and the covariance of those;
+        None where they are too many."""
+        return self._normal.rest_inverse()
+
+    def weighed_rows(self, root_weight: Float) -> "LinearSystem":
+        """The system of the same factors with other weights, at its own solution.
+
+        Args:
+            root_weight: shape (rows,), one over the factors of the rows' standard deviations.
+        """
+        other = copy(self)
+        other.__dict__.pop("_normal", None)
+        other.root = None
+        other.A = csr_matrix(diags(root_weight) @ self.A)
+        other.b = root_weight * self.b
+        other.b = other.b - other.A @ other.solve((other.A.T @ other.b)[:, None])[:, 0]
+        return other
 
     def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""

@@ -54,6 +54,17 @@ class NormalEquations:
         x[self._leaf] = self._inverse @ own - self._gain @ x[self._rest]
         return x
 
+    def rest_inverse(self) -> tuple[Int, Float | None]:
+        """What is left when the leaves are eliminated.
+
+        Returns:
+            place (n,) of every unknown in the rest, -1 for those that are not; and the rest's part of `H^-1`, None
+            where it is too large.
+        """
+        place = np.full(self._size, -1, np.int64)
+        place[self._rest] = np.arange(len(self._rest))
+        return place, self._solve_rest(np.eye(len(self._rest))) if len(self._rest) <= DENSE else None
+
     def inverse_blocks(self, columns: Sequence[slice]) -> list[Float]:
         """Diagonal blocks of `H^-1`. Those of eliminated variables need a solution of the rest only."""
         place = np.empty(self._size, np.int64)

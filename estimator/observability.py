@@ -35,6 +35,9 @@ class Undetermined(ObservabilityError):
         super().__init__(not_observable(key))
         self.key = key
 
+    def __reduce__(self) -> tuple[type["Undetermined"], tuple[int]]:
+        return Undetermined, (self.key,)
+
 
 @contextmanager
 def determined() -> Iterator[None]:

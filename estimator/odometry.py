@@ -50,6 +50,16 @@ class FramePose:
     """Shape (4, 4)."""
 
 
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """How the front end came from one keyframe to the next: what the frames in between were placed by."""
+
+    before: int
+    """Index of the keyframe that its motion counts from."""
+    before_T_this: Float
+    """Shape (4, 4)."""
+
+
 View = tuple[int, StereoFrame, int]
 """Keyframe index, its frame, and a track's row in it."""
 
@@ -66,6 +76,8 @@ class Odometry:
         """Views of waiting tracks before the one that waits, the newest first: they did not agree with the next one."""
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
+        self.arrivals: dict[int, Arrival] = {}
+        """By the index of the keyframe that was come to."""
         self.seen_in: dict[int, int] = {}
         """The last keyframe that saw a landmark."""
         self.observations: dict[int, int] = {}
@@ -131,6 +143,8 @@ class Odometry:
         if len(known) < self._settings.minimum_shared:
             self._create_from_before(update, frame, index, pose)
         self.keyframe_stamps.append(frame.stamp_ns)
+        if self._reference >= 0 and placed is None:
+            self.arrivals[index] = Arrival(self._reference, self._keyframe_T_last)
         self._reference = index
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
@@ -145,6 +159,7 @@ class Odometry:
         self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
         self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
         self.frames = [f for f in self.frames if f.keyframe not in keyframes]
+        self.arrivals = {k: a for k, a in self.arrivals.items() if k not in keyframes and a.before not in keyframes}
 
     def place(self, stamp_ns: int, index: int) -> None:
         """A keyframe that markers alone have placed."""

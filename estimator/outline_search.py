@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +29,33 @@ AXIS_SIGMA_M, DIRECTION_SIGMA_RAD = 0.006, 0.02
 """Sigmas with which the axis of a known pipe is looked for."""
 
 
+@dataclass(frozen=True, slots=True)
+class _View:
+    """One picture in which a pipe's outline is to be looked for."""
+
+    pipe: str
+    camera: str
+    pair: PairImages
+    prior: OutlinePrior
+
+
 class OutlineSearch:
     """Keeps pictures, and looks for pipes in them where the engine's estimate says that they are."""
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, views_at_once: int | None = None) -> None:
+        """
+        Args:
+            views_at_once: views of known pipes that one call looks at, at most; the rest is for `go_on`, so that nobody
+                has to wait long. None for all.
+        """
         self._engine = engine
+        self._at_once = views_at_once
+        self._ahead: deque[_View] = deque()
+        """Views that have been chosen and not looked at."""
+        self._found: list[OutlineSighting | Rejection] = []
+        """In those before them. They enter together, as if there had been no wait."""
+        self._clicked = False
+        """Is there a click that widths have not been measured with?"""
         self._finders: dict[str, OutlineFinder] = {}
         self._widths = PipeWidths(engine)
         self._kept: deque[PairImages] = deque()
@@ -56,24 +79,49 @@ class OutlineSearch:
                 self._about(pick, pair)
         if clicked:
             self._engine.flush()
-        self._look(anew=bool(clicked))
+            self._clicked = True
+        if not self._ahead:
+            self._look()
+        self.go_on()
+
+    def go_on(self, to_the_end: bool = False) -> None:
+        """Looks at views that are chosen; where there are none, nothing happens."""
+        number = len(self._ahead)
+        if self._at_once is not None and not to_the_end:
+            number = min(number, self._at_once)
+        for _ in range(number):
+            view = self._ahead.popleft()
+            finder = self._finder(view.camera)
+            self._found.append(finder.find(view.pair.stamp_ns, view.pipe, view.pair.of(view.camera), view.prior))
+        if self._found and not self._ahead:
+            for found in self._found:
+                self._take(found)
+            self._found.clear()
+            self._engine.flush()
+            self._enter_widths()
 
     def complete(self) -> None:
-        """No more pictures will come."""
-        self._look(anew=True)
+        """No more pictures will come: the widths with all that is known of the axes, and the edges by them."""
+        self.go_on(to_the_end=True)
+        self._clicked = True
+        self._look()
+        self.go_on(to_the_end=True)
 
-    def _look(self, anew: bool) -> None:
-        """All that the kept pictures tell of pipes now."""
-        pipes, found = self._engine.pipes, 0
+    def _look(self) -> None:
+        """Measures widths, and chooses the views to look at."""
+        pipes, anew = self._engine.pipes, self._clicked
+        self._clicked = False
         for pipe in pipes.named():
             ends = pipes.known_part(pipe)
-            if ends is None:
-                continue
-            self._measure_width(pipe, ends, anew)
-            found += sum(self._where_predicted(pipe, camera) for camera in MOBILE)
+            if ends is not None:
+                self._measure_width(pipe, ends, anew)
+                for camera in MOBILE:
+                    self._choose(pipe, camera)
+        self._enter_widths()
+
+    def _enter_widths(self) -> None:
+        for pipe in self._engine.pipes.named():
             self._widths.enter(pipe)
-        if found:
-            self._engine.flush()
 
     def _measure_width(self, pipe: str, ends: tuple[Float, Float], anew: bool) -> None:
         views = [KeptView(pair, camera) for camera in MOBILE for pair in self._differing(pipe, camera, ends)]
@@ -112,15 +160,15 @@ class OutlineSearch:
             looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
             looked[pair.stamp_ns] = where.o_T_c.translation()
 
-    def _where_predicted(self, pipe: str, camera: str) -> int:
-        """Looks for a known pipe's outline in views that differ from those already used; in how many."""
+    def _choose(self, pipe: str, camera: str) -> None:
+        """Views for a known pipe's outline that differ from those already used."""
         expected = self._expected(pipe)
         if expected is None:
-            return 0
+            return
         ends, radius, radius_sigma = expected
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
         passed = self._passed.setdefault(f"{pipe} {camera}", set())
-        found, model = 0, self._engine.cameras[camera]
+        model = self._engine.cameras[camera]
         for pair in [kept for kept in self._kept if kept.stamp_ns not in looked and kept.stamp_ns not in passed]:
             if len(looked) >= OUTLINE_VIEWS:
                 break
@@ -136,9 +184,7 @@ class OutlineSearch:
             prior = predict_outline(model, a, b, radius, AXIS_SIGMA_M, DIRECTION_SIGMA_RAD, sigma)
             if prior is not None:
                 looked[pair.stamp_ns] = place
-                self._take(self._finder(camera).find(pair.stamp_ns, pipe, pair.of(camera), prior))
-                found += 1
-        return found
+                self._ahead.append(_View(pipe, camera, pair, prior))
 
     def _expected(self, pipe: str) -> tuple[tuple[Float, Float], float, float] | None:
         """Part of the axis, radius and the radius's sigma (0: not measured), with which outlines are looked for."""

@@ -37,6 +37,8 @@ class PipeWidths:
         self._found: dict[str, TextureWidth] = {}
         self._views: dict[str, int] = {}
         """Views at the last measurement, found or not."""
+        self._entered: dict[str, TextureWidth] = {}
+        """What the graph holds."""
 
     def of(self, pipe: str) -> TextureWidth | None:
         """The width as it is known now."""
@@ -74,10 +76,11 @@ class PipeWidths:
     def enter(self, pipe: str) -> None:
         """The present width into the graph, in the place of an earlier one."""
         found = self._found.get(pipe)
-        if found is None:
+        if found is None or found is self._entered.get(pipe):
             return
         update = self._engine.pipes.width(pipe, found.radius_m, found.sigma_m, self._engine.end_ns)
         if not update.empty():
+            self._entered[pipe] = found
             self._exchange(update, self._places(WIDTH, pipe))
 
     def forget_outlines(self, pipe: str, stamps: Iterable[int]) -> None:

@@ -17,10 +17,20 @@ from .surfaces import Associator, lay_on_surfaces
 class Pipeline:
     """Feeds one engine with what the front ends see, and looks for pipes where the engine expects them."""
 
-    def __init__(self, rig: Rig, associate: Associator = lay_on_surfaces, together: int = 1) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        associate: Associator = lay_on_surfaces,
+        together: int = 1,
+        views_at_once: int | None = None,
+    ) -> None:
+        """
+        Args:
+            views_at_once: see `OutlineSearch`.
+        """
         self.rig = rig
         self.engine = Engine(rig, {}, associate, together=together)
-        self._outlines = OutlineSearch(self.engine)
+        self._outlines = OutlineSearch(self.engine, views_at_once)
         self._depths = DepthSearch(self.engine)
         self._base = BaseSearch(self.engine)
 
@@ -39,6 +49,8 @@ class Pipeline:
         if sensed.pair is not None and sensed.stamp_ns in engine.keyframe_at:
             self._outlines.see(sensed.pair, sensed.bundle.picks)
             self._base.see(sensed.pair)
+        else:
+            self._outlines.go_on()
         if sensed.depth is not None:
             engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud, moved=sensed.depth.moved))
             self._depths.see(sensed.depth)
@@ -55,6 +67,7 @@ class Pipeline:
 
     def complete(self) -> None:
         """What waited for something else gets its last chance."""
+        self._outlines.go_on(to_the_end=True)
         self.engine.revisit()
         self._outlines.complete()
         if self._base.search(self._depths.view, last=True):

@@ -12,6 +12,7 @@ from ..factors.camera import CameraModel
 from ..factors.measurements import MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
+from ..frontends.stereo.frontend import Early
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
@@ -87,15 +88,19 @@ class Sensing:
         """All messages of one stamp."""
         return self.look(group, self.follow(group))
 
-    def follow(self, group: list[Item]) -> StereoFrame | None:
+    def follow(self, group: list[Item], early: Early | None = None) -> StereoFrame | None:
         """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
+
+        Args:
+            early: told of a keyframe's motion before it is done.
 
         Raises:
             LogError: the pair cannot be used.
         """
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
-        return self.sensors.track(pair) if pair is not None else None
+        clicked = any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
+        return self.sensors.track(pair, clicked, early) if pair is not None else None
 
     def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
         """Everything else that a group shows.

@@ -15,7 +15,7 @@ from ..factors.rig import Rig
 from ..frontends.fiducials.detector import MarkerFrontEnd
 from ..frontends.fiducials.messages import sightings_from_messages
 from ..frontends.paper_chain import clicked_point
-from ..frontends.stereo.frontend import StereoFrontEnd
+from ..frontends.stereo.frontend import Early, StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
 from .depth_sensor import DepthSensor, DepthView
@@ -90,14 +90,19 @@ class Sensors:
 
     # Stereo ---------------------------------------------------------------------------------------------------
 
-    def track(self, pair: PairImages) -> StereoFrame:
-        """Feature tracks of a pair."""
+    def track(self, pair: PairImages, wanted: bool = False, early: Early | None = None) -> StereoFrame:
+        """Feature tracks of a pair.
+
+        Args:
+            wanted: it becomes a keyframe.
+            early: told of a keyframe's motion before it is done.
+        """
         if self._stereo is None:
             left, right = self._camera("m_left"), self._camera("m_right")
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
             self._stereo = StereoFrontEnd(left, right, self.left_T_right())
-        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right)
+        frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right, wanted, early)
         if self._unmatched < UNMATCHED_PAIRS:
             self._check_sides(pair, frame)
         return frame

@@ -38,6 +38,7 @@ from .result import (
     Result,
 )
 from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
+from .trajectory import trajectory
 
 Float = NDArray[np.float64]
 LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "pipe width", "picks")
@@ -67,7 +68,7 @@ class Summary:
         return Result(
             points=points,
             poses=self._poses(),
-            trajectory=self._trajectory(),
+            trajectory=trajectory(engine.odometry, self._values, self._keyframe_covariances()),
             pipes=pipes,
             calibration=calibration_rows(engine, self._values, self._sigmas),
             distances=distances,
@@ -198,18 +199,6 @@ class Summary:
         pose = self._values.atPose3(key)
         covariance = ros_covariance(pose, self._system.joint([key]))
         return PoseEstimate(name, "o", stamp_ns, pose.matrix(), covariance)
-
-    def _trajectory(self) -> tuple[PoseEstimate, ...]:
-        engine = self._engine
-        covariances = self._keyframe_covariances()
-        poses = []
-        for frame in sorted(engine.odometry.frames, key=lambda f: f.stamp_ns):
-            o_T_k = self._values.atPose3(keys.keyframe(frame.keyframe))
-            matrix = o_T_k.matrix() @ frame.keyframe_T_this
-            own = engine.odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns
-            covariance = ros_covariance(o_T_k, covariances[frame.keyframe]) if own else None
-            poses.append(PoseEstimate("m", "o", frame.stamp_ns, matrix, covariance))
-        return tuple(poses)
 
     def _keyframe_covariances(self) -> list[Float]:
         """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""

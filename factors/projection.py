@@ -1,5 +1,7 @@
 """Pixels of points in {o}: native GTSAM factors, with the camera's calibration as a variable."""
 
+from typing import Any
+
 import gtsam
 import gtsam_unstable
 import numpy as np
@@ -7,7 +9,7 @@ from numpy.typing import NDArray
 
 from . import keys
 from .geometry import point_to_frame
-from .noise import Model
+from .noise import Model, gaussian, robust
 
 Float = NDArray[np.float64]
 
@@ -24,6 +26,13 @@ def mobile_projection(camera: str, px: Float, model: Model, keyframe: int, point
     if camera == "m_left":
         return gtsam.GeneralSFMFactor2Cal3DS2(px, model, keyframe, point, keys.intrinsics(camera))
     return _with_extrinsics(camera, px, model, keyframe, point)
+
+
+def reweighed(factor: Any, camera: str, weight: float, robust_sigma: float) -> gtsam.NonlinearFactor:
+    """A factor of `mobile_projection` with `weight` times its information."""
+    pose, point = (next(k for k in factor.keys() if keys.kind(k) == kind) for kind in "xl")
+    covariance = np.linalg.inv(factor.noiseModel().noise().information()) / weight
+    return mobile_projection(camera, factor.measured(), robust(gaussian(covariance), robust_sigma), pose, point)
 
 
 def machine_projection(px: Float, model: Model, base: int, point: int) -> gtsam.NonlinearFactor:

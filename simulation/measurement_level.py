@@ -28,6 +28,7 @@ from .measurement_level_truth import (
     invert,
     nominal_rig,
     transform,
+    with_stereo_fault,
 )
 from .measurement_level_world import World
 
@@ -103,6 +104,8 @@ def _build_world(scenario: Scenario, rng: np.random.Generator, outlier_rng: np.r
         if scenario.faults
         else nominal_rig(rig, nominal, scenario.baseline_m)
     )
+    if scenario.stereo is not None:
+        true = with_stereo_fault(true, scenario.baseline_m, scenario.stereo)
     first = rig.boards[0].id
     true.boards[first] = misprinted(true.boards[first], scenario.board)
     w_T_f = {rig.boards[0].id: scene.w_T_b @ invert(true.f_T_b)}

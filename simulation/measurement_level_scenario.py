@@ -123,6 +123,13 @@ class BoardFaults(Section):
     """All corners found so far inside their markers, along the diagonal."""
 
 
+class StereoFault(Section):
+    """How far the stereo pair is off its calibration, set instead of drawn. Positive: depth reads short."""
+
+    baseline_rel: float = 0.0
+    disparity_px: float = 0.0
+
+
 class Scenario(Section):
     """One kind of run. Every run draws scene, faults of the rig, motion and noise anew from its seed."""
 
@@ -147,6 +154,8 @@ class Scenario(Section):
     board: BoardFaults = BoardFaults()
     faults: bool = True
     """False: the rig is in truth exactly as its file says."""
+    stereo: StereoFault | None = None
+    """Baseline and vergence of the pair; None: drawn like the rest."""
     typed_side_m: Positive | None = None
     """Side length that the rig file gives when it is wrong; None: the right one."""
     nominal_diameter: bool = True

@@ -1,6 +1,6 @@
 """The truth of one run: the rig as it really is, and where everything was. Only the evaluation reads it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ..factors.board import CORNER_PRINT_SIGMA_M, DIRECTIONS, marker_rotation
 from ..factors.calibration import ASPECT_REL, depth_ray_sigmas
 from ..factors.rig import Board, Pose, Rig
+from .measurement_level_scenario import StereoFault
 
 Float = NDArray[np.float64]
 
@@ -138,6 +139,19 @@ def nominal_rig(rig: Rig, cameras: dict[str, TrueCamera], baseline_m: float) -> 
         depth_rays=np.zeros(3),
         boards={board.id: draw_board(board, None) for board in rig.boards},
     )
+
+
+def with_stereo_fault(rig: TrueRig, baseline_m: float, fault: StereoFault) -> TrueRig:
+    """The same rig with a pair that is off by just so much; nothing else is drawn anew.
+
+    Args:
+        rig: as drawn.
+        baseline_m: as the calibration says, axes parallel.
+        fault: in place of what was drawn.
+    """
+    turn_rad = fault.disparity_px / float(rig.cameras["m_left"].K[0, 0])
+    translation_m = np.array([baseline_m * (1.0 + fault.baseline_rel), 0.0, 0.0])
+    return replace(rig, m_left_T_m_right=matrix(np.array([0.0, turn_rad, 0.0]), translation_m))
 
 
 def draw_board(board: Board, rng: np.random.Generator | None, lasting_m: float = 0.0) -> TrueBoard:

@@ -142,6 +142,8 @@ class Timeline(Section):
     """A hand on the lens."""
     still: tuple[Interval, ...] = ()
     """The mobile camera is put down."""
+    turned: tuple[Interval, ...] = ()
+    """The mobile camera looks away: it turns by 115 degrees within a quarter of a second, and back as fast."""
     base_move: Interval | None = None
     """The machine drives to a second station."""
     arm_moves: bool = False

@@ -14,6 +14,9 @@ from .scenario import Scenario
 
 Float = NDArray[np.float64]
 _GRID_HZ = 200
+_AWAY_RAD = 2.0
+_AWAY_S = 0.25
+"""How long it takes to look away: 8 rad/s, half an image from one frame to the next."""
 # Amplitude and frequency of a hand's tremor: metres, radians, hertz.
 _TREMOR = ((0.0015, 0.003, 0.7), (0.0006, 0.0016, 2.3), (0.00025, 0.0009, 6.1))
 
@@ -63,6 +66,7 @@ def plan(scenario: Scenario, cell: Cell, w_T_c: Float, rng: np.random.Generator)
     values = gaussian_filter1d(values, softness * _GRID_HZ, axis=0, mode="nearest")
     calm = gaussian_filter1d(warped[1], 0.1 * _GRID_HZ)[:, None]
     values += calm * _tremor(grid, 1.0 if scenario.motion == "smooth" else 1.8, rng)
+    values[:, 3] += _looking_away(grid, scenario.timeline.turned)
     moved = [tuple(np.interp([a * duration, b * duration], warped[0], grid)) for a, b in dwells]
     return Trajectory(CubicSpline(grid, values), tuple((float(a), float(b)) for a, b in moved))
 
@@ -140,6 +144,15 @@ def _warped(
     free = np.maximum(pace * (grid >= 0) * (grid <= duration), 0)
     progress = np.cumsum(free)
     return progress / max(progress[-1], 1) * duration, pace
+
+
+def _looking_away(grid: Float, turned: tuple[tuple[float, float], ...]) -> Float:
+    """Yaw (n,) on top of the plan's, with a smooth start and end of each turn."""
+    total = np.zeros_like(grid)
+    for start, end in turned:
+        there, back = (np.clip((grid - at) / _AWAY_S, 0.0, 1.0) for at in (start, end))
+        total += _AWAY_RAD * sum(sign * share**2 * (3.0 - 2.0 * share) for sign, share in ((1, there), (-1, back)))
+    return total
 
 
 def _tremor(grid: Float, strength: float, rng: np.random.Generator) -> Float:

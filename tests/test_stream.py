@@ -2,14 +2,12 @@
 
 import json
 import signal
-import socket
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from stream_process import free_port, lines, started
 
 from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
@@ -24,10 +22,7 @@ SAMPLE = Path(__file__).parents[1] / "logs" / "sample.mcap"
 
 
 def surecut(*arguments):
-    script = "from surecut.estimator.cli import main; main()"
-    return subprocess.Popen(
-        [sys.executable, "-c", script, "stream", *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    return started(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
 @pytest.fixture(scope="module")
@@ -93,26 +88,11 @@ def test_memory_is_data_that_is_checked(streamed):
             from_json(spoilt)
 
 
-def free_port():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
-
-
 def first_line(port, seconds, wanted=lambda update: update["points"]):
     """The first JSON line that has what is wanted; by itself, one that says where the points are."""
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        try:
-            with socket.create_connection(("127.0.0.1", port), timeout=1) as connection:
-                connection.settimeout(2)
-                with connection.makefile("rb") as lines:
-                    for line in lines:
-                        update = json.loads(line)
-                        if wanted(update):
-                            return update
-        except OSError:
-            time.sleep(0.05)
+    for update in lines(port, seconds):
+        if wanted(update):
+            return update
     raise AssertionError(f"no such line within {seconds} s")
 
 

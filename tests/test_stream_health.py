@@ -156,6 +156,6 @@ def test_images_that_cannot_be_decoded_are_counted_by_topic():
     whole, broken = image(LEFT, 0), image(RIGHT, 0)
     pixels = CompressedPixels("png", np.frombuffer(b"\x89PNG\r\n\x1a\n no more", np.uint8))
     broken = replace(broken, body=ImageBody(pixels, RIGHT))
-    loop.take(Group([StereoPair(whole, broken)]).items)
+    loop.take(Group([StereoPair(whole, broken)]))
     assert [said.unreadable for said in out if isinstance(said, Worked)] == [(RIGHT,)]
     assert not [handed for handed in look if isinstance(handed, Tracked)]

@@ -52,6 +52,8 @@ class Follower:
         self._lost_s = 0.0
         self._at_ns = 0
         """Stamp of the newest frame in the chain."""
+        self._early: Frame | None = None
+        """The newest frame, while it is still in the making."""
 
     def anchored(self) -> bool:
         return self._anchor_ns is not None
@@ -62,6 +64,9 @@ class Follower:
 
     def frame(self, frame: Frame) -> Followed | None:
         """A frame's pose; None while the graph has placed no keyframe."""
+        self._early = frame if frame.early else None
+        if frame.early:
+            return None if self._anchor_ns is None else self._now(frame.stamp_ns)
         self._frames[frame.stamp_ns] = frame
         while len(self._frames) > KEPT:
             self._frames.popitem(last=False)
@@ -111,12 +116,15 @@ class Follower:
         self._variance += MEMORY * (off**2 / steps - self._variance)
 
     def _now(self, stamp_ns: int) -> Followed:
-        since = pose3(self._since)
-        matrix = self._anchor.matrix @ self._since
+        chain, steps = self._since, self._steps
+        if self._early is not None:  # one on from the newest of the chain
+            stamp_ns, chain, steps = self._early.stamp_ns, chain @ self._early.last_T_this, float(np.floor(steps)) + 0.5
+        since = pose3(chain)
+        matrix = self._anchor.matrix @ chain
         own = self._anchor.covariance if self._anchor.covariance is not None else np.zeros((6, 6))
         back = since.inverse().AdjointMap()
         turned, moved = LOST_TURN_RAD_S * self._lost_s, LOST_SPEED_M_S * self._lost_s
         lost = np.array([turned**2] * 3 + [moved**2] * 3)
-        covariance = back @ own @ back.T + np.diag(self._steps * self._variance + lost)
+        covariance = back @ own @ back.T + np.diag(steps * self._variance + lost)
         behind = sum(stamp > (self._anchor_ns or 0) for stamp in self._frames)
         return Followed(stamp_ns, matrix, covariance, behind)

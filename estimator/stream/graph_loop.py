@@ -19,6 +19,7 @@ from ..points_in_base import pipe_estimate, point_blocks, radius95
 from ..result import PipeEstimate, PointEstimate, PoseEstimate, Result
 from ..sensing import Sensed
 from ..validated_range import ValidatedRange
+from .aside import Aside
 from .audit import Audit, audit
 from .calibration import departures, held, hold
 from .memory import Memory, recall, remember, save
@@ -41,6 +42,7 @@ class GraphLoop:
         tell: takes each answer.
         memory: what an earlier run knew.
         checkpoint: file that is kept up to date; None for none.
+        apart: the audit and the checkpoint are made by copies of the process, so that no answer waits for them.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class GraphLoop:
         memory: Memory | None = None,
         checkpoint: Path | None = None,
         validated: ValidatedRange | None = None,
+        apart: bool = False,
     ) -> None:
         self.rig = rig
         self._settings = settings
@@ -58,13 +61,17 @@ class GraphLoop:
         self._checkpoint = checkpoint
         self._validated = validated
         self._rig_sha256 = sha256_of(rig)
-        self.pipeline = Pipeline(rig)
+        self.pipeline = Pipeline(rig, views_at_once=settings.views_at_once)
         self.engine = self.pipeline.engine
         self._bounded = Bounded(self.engine, settings.limits)
         if memory is not None:
             recall(self.engine, memory)
             self._bounded.first = memory.keyframes
         self._audit = Audit()
+        self._auditing: Aside[Audit] = Aside(apart)
+        self._saving: Aside[str] = Aside(apart)
+        self._told_s = 0.0
+        """When the last answer was told, by the computer's clock."""
         self._next_audit_ns = self._next_answer_ns = 0
         self._saved_s = time.monotonic()
         self._answer: Answer | None = None
@@ -124,11 +131,13 @@ class GraphLoop:
     # Out ------------------------------------------------------------------------------------------------------
 
     def _answer_when_due(self, stamp_ns: int, at_once: bool, busy: bool) -> None:
-        period = self._settings.answer_period_ns * (5 if busy else 1)
+        period = self._settings.answer_period_ns
         if self._next_answer_ns - stamp_ns > 2 * period:
             self._next_answer_ns = 0  # the clock was set back
         if stamp_ns < self._next_answer_ns and not at_once:
             return
+        if busy and time.monotonic() - self._told_s < period / S:
+            return  # what waits passes faster than it was measured
         self._next_answer_ns = stamp_ns + period
         self.answer(stamp_ns)
 
@@ -138,6 +147,7 @@ class GraphLoop:
 
     def answer(self, stamp_ns: int) -> Answer | None:
         """Tells what is known now; None while nothing is."""
+        self._take_audit()
         if self._changed or self._answer is None:
             self._maybe_audit(stamp_ns)
             made = self._made(stamp_ns)
@@ -151,20 +161,29 @@ class GraphLoop:
             )
         self._answer = replace(self._answer, counts=dict(self.counts), cpu_s=time.process_time())
         self._tell(self._answer)
+        self._told_s = time.monotonic()
         return self._answer
 
     def _maybe_audit(self, stamp_ns: int) -> None:
         if stamp_ns < self._next_audit_ns and self._next_audit_ns - stamp_ns <= self._settings.audit_period_ns:
             return
-        if self.engine.odometry.last_keyframe < 0 or self.engine.graph.unsolved:
+        if self.engine.odometry.last_keyframe < 0 or self.engine.graph.unsolved or self._auditing.busy():
             return
         self._next_audit_ns = stamp_ns + self._settings.audit_period_ns
         if self.engine.boards.any_known():
             self.engine.revisit()
+        self._auditing.begin(lambda: audit(self.engine))
+        self._take_audit()
+
+    def _take_audit(self) -> None:
+        """The audit's outcome, when it is there."""
         try:
-            self._audit = audit(self.engine)
+            found = self._auditing.taken()
         except ObservabilityError:
             self.counts["undetermined"] += 1
+            return
+        if found is not None:
+            self._audit, self._changed = found, True
 
     def _made(self, stamp_ns: int) -> Answer | None:
         engine, state = self.engine, self.engine.state
@@ -177,11 +196,13 @@ class GraphLoop:
         except ObservabilityError:
             self.counts["undetermined"] += 1
             return None
+        points = self._points(posterior)
         answer = Answer(
             stamp_ns=stamp_ns,
             keyframe_ns=engine.odometry.keyframe_stamps[-1] if newest else None,
             places=self._places(posterior, newest),
-            points=self._points(posterior),
+            points=points,
+            joint_m2=self._joint(posterior, [point.id for point in points]),
             pipes=self._pipes(posterior),
             calibration=departures(engine, posterior),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)[-EVENTS:]),
@@ -224,6 +245,18 @@ class GraphLoop:
                 )
             )
         return tuple(found)
+
+    def _joint(self, posterior: Posterior, names: list[str]) -> Float:
+        """Covariance of points in {b} together: they share machine, board and calibration."""
+        rows: list[tuple[int, Float]] = []
+        wide = np.sqrt([self._audit.widening.get(name, 1.0) for name in names])
+        for i, name in enumerate(names):
+            key = keys.point(self.engine.pipes.points[name].index)
+            for variable, block in point_blocks(posterior.values, keys.base(0), key)[1]:
+                whole = np.zeros((3 * len(names), block.shape[1]))
+                whole[3 * i : 3 * i + 3] = wide[i] * block
+                rows.append((variable, whole))
+        return posterior.covariance(rows) if rows else np.zeros((0, 0))
 
     def _axis(self, posterior: Posterior, pipe: str | None) -> Float | None:
         cylinder = self.engine.pipes.cylinders.get(pipe or "")
@@ -274,13 +307,15 @@ class GraphLoop:
     def checkpoint_when_due(self) -> None:
         """Writes the file every few seconds; a full disk is counted, not fatal."""
         now = time.monotonic()
-        if self._checkpoint is None or now - self._saved_s < self._settings.checkpoint_period_s:
-            return
+        due = self._checkpoint is not None and now - self._saved_s >= self._settings.checkpoint_period_s
         try:
-            self.save()
+            if due and not self._saving.busy() and not self.engine.graph.unsolved:
+                self._saved_s = now
+                self._saving.begin(self._written)
+            if self._saving.taken() is not None:
+                self.counts["checkpoints"] += 1
         except SurecutError:
             self.counts["checkpoint_errors"] += 1
-        self._saved_s = now
 
     def save(self) -> str:
         """Writes the checkpoint now.
@@ -288,11 +323,21 @@ class GraphLoop:
         Raises:
             SurecutError: there is no place for it, nothing to remember, or the disk is full.
         """
+        self._saving.stop()
+        text = self._written()
+        self.counts["checkpoints"] += 1
+        return text
+
+    def close(self) -> None:
+        """Ends what copies of the process still do."""
+        self._auditing.stop()
+        self._saving.stop()
+
+    def _written(self) -> str:
         if self._checkpoint is None:
             raise SurecutError("there is no file to save to; start with --checkpoint FILE")
         memory = remember(self.engine)
         if memory is None:
             raise SurecutError("nothing to remember yet: no board has a place")
         save(memory, self._checkpoint, self._rig_sha256, self._answer)
-        self.counts["checkpoints"] += 1
         return f"saved to {self._checkpoint}"

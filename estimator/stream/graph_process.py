@@ -9,16 +9,17 @@ from ...factors.errors import SurecutError
 from ..sensing import Sensed
 from .graph_loop import GraphLoop
 from .memory import load
-from .parent import GRAPH_NICE, end_with_parent, give_way
+from .parent import GRAPH_NICE, end_with_parent, give_way, keep_loaded
 from .wire import Died, Done, GraphTask, LateClick, Order, Ready
 
 BUSY = 20
-"""Stamps that wait from which on answers are rarer."""
+"""Stamps that wait from which on answers come by the computer's clock."""
 
 
 def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     """The process."""
     end_with_parent()
+    keep_loaded()
     if not task.patient:
         give_way(GRAPH_NICE)
     try:
@@ -46,7 +47,7 @@ def solve(task: GraphTask, inbox: Any, out: Any) -> None:
 
 def _started(task: GraphTask, out: Any, prior: Path | None) -> GraphLoop:
     memory = load(prior) if prior is not None and prior.exists() else None
-    loop = GraphLoop(task.rig, task.settings, out.put, memory, task.checkpoint, task.validated)
+    loop = GraphLoop(task.rig, task.settings, out.put, memory, task.checkpoint, task.validated, not task.patient)
     if memory is not None:
         loop.answer(memory.stamp_ns)
     return loop
@@ -69,6 +70,7 @@ def _look_back(loop: GraphLoop, item: LateClick, out: Any) -> None:
 def _obeyed(loop: GraphLoop, order: Order, task: GraphTask, out: Any) -> GraphLoop:
     try:
         if order.what == "reset":
+            loop.close()
             loop = _started(task, out, None)
             out.put(Done("reset", "map, poses and points are forgotten"))
         elif order.what == "save":
@@ -82,6 +84,7 @@ def _obeyed(loop: GraphLoop, order: Order, task: GraphTask, out: Any) -> GraphLo
 
 def _finish(loop: GraphLoop, out: Any) -> None:
     """The last answer, with everything that waited."""
+    loop.close()
     loop.pipeline.complete()
     loop.engine.flush()
     loop.mark_changed()

@@ -1,12 +1,11 @@
 """The other front ends' process: markers, surfaces, clicks; what was seen at each stamp goes to the graph."""
 
 import time
-import traceback
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ...factors.errors import SurecutError
@@ -20,10 +19,11 @@ from ..bundle import Bundle
 from ..items import Item, unreadable
 from ..sensing import Sensed, Sensing, images
 from ..sensors import PairImages
-from .parent import LOOK_NICE, end_with_parent, give_way
+from .parent import LOOK_NICE
+from .serving import serve
 from .settings import StreamSettings
 from .thinning import Thinning
-from .wire import Died, LateClick, Order, Ready, Tracked, Worked
+from .wire import LateClick, Tracked, Worked
 
 REFUSALS = 1000
 """Refused measurements that are kept with their words."""
@@ -35,25 +35,8 @@ def look(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, graph: A
     Args:
         patient: the sources wait, so that no pose is late.
     """
-    end_with_parent()
-    if not patient:
-        give_way(LOOK_NICE)
-    cv2.setNumThreads(1)
-    try:
-        loop = LookLoop(rig, settings, patient, graph, out)
-        out.put(Ready("front ends"))
-        while True:
-            item = inbox.get()
-            if isinstance(item, Tracked):
-                loop.take(item)
-            elif isinstance(item, Order):
-                graph.put(item)
-                if item.what == "finish":
-                    return
-                if item.what == "reset":
-                    loop = LookLoop(rig, settings, patient, graph, out, loop.calibrations)
-    except Exception:
-        out.put(Died("front ends", traceback.format_exc()))
+    niceness = 0 if patient else LOOK_NICE
+    serve("front ends", niceness, lambda known: LookLoop(rig, settings, patient, graph, out, known), inbox, graph, out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +61,7 @@ class LookLoop:
         patient: bool,
         graph: Any,
         out: Any,
-        calibrations: dict[str, Message] | None = None,
+        calibrations: Mapping[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
         self._settings = settings

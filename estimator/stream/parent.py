@@ -1,11 +1,12 @@
-"""What a child process does for its parent: it ends with it, and lets it go first."""
+"""What the processes of a stream do for each other: they end with their parent, and let others go first."""
 
+import gc
 import multiprocessing
 import os
 import signal
 import threading
 
-LOOK_NICE, GRAPH_NICE = 5, 10
+LOOK_NICE, GRAPH_NICE = 10, 15
 """Niceness: the pose of the camera goes before markers and surfaces, and these before the graph."""
 
 
@@ -21,6 +22,13 @@ def end_with_parent() -> None:
         os._exit(0)  # queues may be full, and nobody is left to read them
 
     threading.Thread(target=watch, name="surecut-parent", daemon=True).start()
+
+
+def keep_loaded() -> None:
+    """Call once all modules are loaded: what they hold stays, and looking through it for garbage would stop a pose for
+    a tenth of a second."""
+    gc.collect()
+    gc.freeze()
 
 
 def give_way(niceness: int) -> None:

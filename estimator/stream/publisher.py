@@ -29,8 +29,16 @@ def update_of(
     if followed is not None:
         poses["m"] = _pose(Place(followed.matrix, followed.covariance))
     points, verdict = _points(answer, stamp_ns, health, settings)
-    ages = [point.age_s for point in points]
-    return LiveUpdate(stamp_ns, sent_ns, poses, points, verdict, max(ages, default=0.0), health, counters)
+    age_s = max((point.age_s for point in points), default=0.0)
+    joint = None
+    if answer is not None and answer.joint_m2 is not None:
+        positions = np.array([point.xyz_m for point in points])
+        joint = grown(answer.joint_m2, positions, min(age_s, 1e6), settings)
+    until_ns = 0 if answer is None else answer.stamp_ns
+    return LiveUpdate(
+        stamp_ns, sent_ns, poses, points, verdict, age_s, health, counters,
+        points_stamp_ns=until_ns, points_covariance_m2=joint,
+    )  # fmt: skip
 
 
 def _pose(place: Place) -> LivePose:

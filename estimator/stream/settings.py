@@ -31,6 +31,8 @@ class StreamSettings:
     """How far back a click may be: pictures of so long are kept."""
     answer_period_ns: int = 400 * MS
     """Points in {b} with covariance at least so often, while measurements come."""
+    views_at_once: int = 4
+    """Pictures that are searched for a pipe's outline before the next answer."""
     audit_period_ns: int = 20 * S
     """Between tests of the model against its own data."""
     checkpoint_period_s: float = 5.0

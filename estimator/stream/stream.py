@@ -23,6 +23,7 @@ from .children import NAMES, Children
 from .follower import Followed
 from .latency import Latencies
 from .ordering import LiveOrder
+from .parent import keep_loaded
 from .publisher import update_of
 from .remembered import remembered
 from .settings import StreamSettings
@@ -117,6 +118,7 @@ class Stream:
             for sink in self._sinks:
                 sink.start(self._commanded)
             self._start_children()
+            keep_loaded()
             for source in self._sources:
                 source.start(self._deliver_to(source))
             while not self._stopping.is_set():
@@ -283,6 +285,8 @@ class Stream:
             times = arrived, frame.taken_ns, frame.tracked_ns, now
             for part, began, ended in zip(self._parts.values(), times[:-1], times[1:], strict=True):
                 part.add(ended - began)
+        if frame.early:
+            return
         self._count("frames")
         self._count("lost_frames", int(frame.lost))
         self._count("tracking_cpu_us", round(1e6 * frame.cpu_s))

@@ -1,10 +1,11 @@
 """The tracking's process: it does nothing that a pose has to wait for but the pose."""
 
 import time
-import traceback
+from collections.abc import Mapping
 from typing import Any
 
-import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from ...factors.errors import SurecutError
 from ...factors.rig import Rig
@@ -12,10 +13,12 @@ from ...io.messages import CloudBody, DepthBody, ImageBody, Message
 from ...io.pairing import StereoPair
 from ..items import Item, unreadable
 from ..sensing import Sensing
-from .parent import end_with_parent
+from .serving import serve
 from .settings import StreamSettings
 from .thinning import Thinning
-from .wire import Died, Frame, Group, Order, Ready, Tracked, Worked
+from .wire import Frame, Group, Tracked, Worked
+
+Float = NDArray[np.float64]
 
 
 def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: Any, out: Any) -> None:
@@ -24,23 +27,7 @@ def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: A
     Args:
         patient: nothing may be left out, however long it takes.
     """
-    end_with_parent()
-    cv2.setNumThreads(1)
-    try:
-        loop = TrackLoop(rig, settings, patient, look, out)
-        out.put(Ready("tracking"))
-        while True:
-            item = inbox.get()
-            if isinstance(item, Group):
-                loop.take(item.items)
-            elif isinstance(item, Order):
-                look.put(item)
-                if item.what == "finish":
-                    return
-                if item.what == "reset":
-                    loop = TrackLoop(rig, settings, patient, look, out, loop.calibrations)
-    except Exception:
-        out.put(Died("tracking", traceback.format_exc()))
+    serve("tracking", 0, lambda known: TrackLoop(rig, settings, patient, look, out, known), inbox, look, out)
 
 
 class TrackLoop:
@@ -57,24 +44,25 @@ class TrackLoop:
         patient: bool,
         look: Any,
         out: Any,
-        calibrations: dict[str, Message] | None = None,
+        calibrations: Mapping[str, Message] | None = None,
     ) -> None:
         self._sensing = Sensing(rig)
         self._thinning = Thinning(look, settings, patient)
         self._look = look
         self._out = out
-        self.calibrations = calibrations or {}
+        self.calibrations = dict(calibrations or {})
         self._sensing.calibrate([*self.calibrations.values()])
 
-    def take(self, items: list[Item]) -> None:
-        """A group. A pair that cannot be used is told, and the stream goes on."""
+    def take(self, group: Group) -> None:
+        """A pair that cannot be used is told, and the stream goes on."""
+        items: list[Item] = group.items
         for item in items:
             if self._sensing.is_calibration(item):
                 self.calibrations[item.topic] = item
         taken_ns, began = time.monotonic_ns(), time.process_time()
         frame, problem = None, None
         try:
-            frame = self._sensing.follow(items)
+            frame = self._sensing.follow(items, lambda motion, inliers: self._early(items, motion, inliers, taken_ns))
         except SurecutError as error:
             problem = " ".join(str(error).split())
         cpu_s = time.process_time() - began
@@ -87,6 +75,11 @@ class TrackLoop:
             items = [item for item in items if not isinstance(item, StereoPair)]  # it is told once
         if items:
             self._hand_on(Tracked(items, frame))
+
+    def _early(self, items: list[Item], motion: Float, inliers: int, taken_ns: int) -> None:
+        """A keyframe takes many times as long as its motion, on which the pose of the camera waits."""
+        stamp_ns = next(item.stamp_ns for item in items if isinstance(item, StereoPair))
+        self._out.put(Frame(stamp_ns, motion, False, False, inliers, taken_ns, time.monotonic_ns(), early=True))
 
     def _hand_on(self, tracked: Tracked) -> None:
         """To the other front ends. Where these are behind, frames and what is only about surfaces are left out: the

@@ -13,18 +13,24 @@ RANK = {"GO": 0, "MEASURE MORE": 1, "NO-GO": 2, EXPIRED: 3}
 """From good to bad."""
 
 
-def grown(covariance_m2: Float, position_m: Float, age_s: float, settings: StreamSettings) -> Float:
-    """Covariance (3, 3) of a point in {b} when {b} was tied to a board so long ago.
+def grown(covariance_m2: Float, positions_m: Float, age_s: float, settings: StreamSettings) -> Float:
+    """Joint covariance (3 n, 3 n) of n points in {b} when {b} was tied to a board so long ago.
 
     The machine may have crept and turned meanwhile: a random walk of its place, and of its attitude about its origin,
-    which moves a point at `position_m` across the line of sight to it.
+    which moves a point across the line of sight to it. All points move with it together.
+
+    Args:
+        covariance_m2: shape (3 n, 3 n), of then.
+        positions_m: shape (n, 3), or (3,) of one.
     """
     age = max(age_s, 0.0)
     shift = settings.unseen_walk_m_per_root_s**2 * age
     turn = settings.unseen_turn_rad_per_root_s**2 * age
-    p = np.asarray(position_m, float)
-    across = float(p @ p) * np.eye(3) - np.outer(p, p)
-    return covariance_m2 + shift * np.eye(3) + turn * across
+    x, y, z = np.asarray(positions_m, float).reshape(-1, 3).T
+    nought = np.zeros_like(x)
+    across = np.stack([nought, -z, y, z, nought, -x, -y, x, nought], axis=1).reshape(-1, 3)
+    along = np.tile(np.eye(3), (len(x), 1))
+    return covariance_m2 + shift * along @ along.T + turn * across @ across.T
 
 
 def verdict_of(decision: Decision | None, now_ns: int) -> tuple[str, str]:

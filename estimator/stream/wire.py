@@ -42,7 +42,7 @@ class Tracked:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """From the tracking at once: how the mobile camera moved."""
+    """From the tracking: how the mobile camera moved."""
 
     stamp_ns: int
     last_T_this: Float
@@ -56,6 +56,8 @@ class Frame:
     """When it was done."""
     cpu_s: float = 0.0
     """Processor time that it took."""
+    early: bool = False
+    """By the flow alone, of a keyframe that is still in the making: it comes again, with the same stamp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +109,8 @@ class Answer:
     """`m` at that keyframe, `b`, and the boards."""
     points: tuple[PointEstimate, ...] = ()
     """In {b}, with the covariance of the moment of the last look at a board."""
+    joint_m2: Float | None = None
+    """Shape (3 n, 3 n), of all n points together, in their order."""
     pipes: tuple[PipeEstimate, ...] = ()
     decisions: tuple[Decision, ...] = ()
     """Of the cut plan, as if asked at the last look at a board."""

@@ -32,6 +32,8 @@ _MIN_CONTRAST = 8.0
 """Grey values between black and white."""
 _MIN_SHARE = 0.5
 """Of the pattern's edges, what has to be seen as the model says."""
+_SAME_PLACE = 0.2
+"""Share of its side by which a marker that was read may lie off the place where it was followed to."""
 _SETTLED_PX = 0.3
 _MAX_SIGMA_CELLS = 0.5
 """A corner that is not known to half a cell is no measurement."""
@@ -94,12 +96,13 @@ class MarkerFrontEnd:
         """
         grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
         grey = np.ascontiguousarray(grey, np.uint8)
-        good = self._followed(grey)
-        rejections: list[Rejection] = []
-        if good is None:
-            good, rejections = self._searched(stamp_ns, grey)
+        good, rejections = self._followed(grey), []
+        if good is not None and not self._search.due():
+            self._search.passed()
+        else:
+            good, rejections = self._searched(stamp_ns, grey, good or [])
         good += self._expected(grey, good)
-        sightings = [self._sighting(stamp_ns, f) for f in good]
+        sightings = self._sightings(stamp_ns, good)
         self._search.remember([s.raw_px for s in sightings], grey.shape)
         followed = zip(good, sightings, strict=True)
         self._flow.remember(
@@ -110,8 +113,6 @@ class MarkerFrontEnd:
 
     def _followed(self, grey: NDArray[np.uint8]) -> list[_Fitted] | None:
         """The markers of the last image, all of them, where their corners have gone; None when any is in doubt."""
-        if self._search.due():
-            return None
         raw = self._flow.follow(grey)
         if raw is None:
             return None
@@ -131,21 +132,34 @@ class MarkerFrontEnd:
                 unexplained = max(_UNEXPLAINED_GROWTH * (1.0 - m.correlation**2), _UNEXPLAINED)
                 limit = max(_MIN_CORRELATION, float(np.sqrt(max(1.0 - unexplained, 0.0))))
                 result.append(_judged(candidates[k], ideal[k], fit, k, cells, limit))
-        if any(f.problem is not None for f in result):
-            return None
-        self._search.passed()
-        return result
+        return result if all(f.problem is None for f in result) else None
 
-    def _searched(self, stamp_ns: int, grey: NDArray[np.uint8]) -> tuple[list[_Fitted], list[Rejection]]:
-        """Markers that are read in the image, and what was refused."""
+    def _searched(
+        self, stamp_ns: int, grey: NDArray[np.uint8], followed: list[_Fitted]
+    ) -> tuple[list[_Fitted], list[Rejection]]:
+        """Markers that are read in the image, and what was refused.
+
+        Where nothing was read but the markers that were followed here, their fits stand.
+        """
         found = self._search.find(grey)
         known = [c for c in found if (c.dictionary, c.marker) in self._patterns]
         unknown = [c for c in found if (c.dictionary, c.marker) not in self._patterns]
         rejections = [] if not unknown else [self._unknown(stamp_ns, unknown)]
+        if self._confirmed(followed, known):
+            return followed, rejections
         fitted = self._fit(grey, known, _MIN_CORRELATION)
         good, refused = self._one_per_marker([f for f in fitted if f.problem is None])
         refused += [f for f in fitted if f.problem is not None]
         return good, [*rejections, *(self._rejection(stamp_ns, f) for f in refused)]
+
+    def _confirmed(self, followed: list[_Fitted], read: list[Candidate]) -> bool:
+        """Has each marker that was followed been read once where it was followed to, and none beside them?"""
+        places = {f.candidate.key: f.corners for f in followed}
+        if not followed or len(read) != len(places) or {c.key for c in read} != set(places):
+            return False
+        off = [np.abs(self._ours(c, False) - places[c.key]).max() for c in read]
+        sides = [np.sqrt(cv2.contourArea(places[c.key].astype(np.float32))) for c in read]
+        return bool(np.all(np.array(off) < _SAME_PLACE * np.array(sides)))
 
     def _expected(self, grey: NDArray[np.uint8], good: list[_Fitted]) -> list[_Fitted]:
         """Markers of the boards in view that were not read, where they fit the image."""
@@ -214,20 +228,28 @@ class MarkerFrontEnd:
                     )
         return good, refused
 
-    def _sighting(self, stamp_ns: int, fitted: _Fitted) -> MarkerSighting:
-        covariance = fitted.covariance + CORNER_FLOOR_PX**2 * np.eye(8)
-        blocks = np.stack([covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
-        return MarkerSighting(
-            stamp_ns,
-            self._name,
-            self._boards[fitted.candidate.key].id,
-            fitted.candidate.marker,
-            fitted.corners,
-            blocks,
-            distort(self._camera, fitted.corners),
-            float(np.sqrt(fitted.structure * np.trace(blocks.mean(0)) / 2)),
-            independent_scale(covariance, fitted.corners),
-        )
+    def _sightings(self, stamp_ns: int, good: list[_Fitted]) -> list[MarkerSighting]:
+        if not good:
+            return []
+        corners = np.stack([f.corners for f in good])
+        covariance = np.stack([f.covariance for f in good]) + CORNER_FLOOR_PX**2 * np.eye(8)
+        raw, scale = distort(self._camera, corners), independent_scale(covariance, corners)
+        blocks = np.stack([covariance[:, k : k + 2, k : k + 2] for k in range(0, 8, 2)], 1)
+        common = np.sqrt([f.structure for f in good] * np.einsum("mkii->m", blocks) / 8)
+        return [
+            MarkerSighting(
+                stamp_ns,
+                self._name,
+                self._boards[f.candidate.key].id,
+                f.candidate.marker,
+                f.corners,
+                blocks[k],
+                raw[k],
+                float(common[k]),
+                float(scale[k]),
+            )
+            for k, f in enumerate(good)
+        ]
 
     def _rejection(self, stamp_ns: int, fitted: _Fitted) -> Rejection:
         assert fitted.problem is not None

@@ -44,23 +44,26 @@ class EdgeErrors:
 
 
 def edge_errors(
-    columns: Single, inverse: Float, residual: Single, weight: Single, shifts: tuple[Single, Single], place: Single
+    columns: Single, inverse: Float, residual: Single, weight: Single, shifts: Single, place: Single
 ) -> EdgeErrors:
     """Variance components of m fits.
 
     Args:
-        columns: Jacobian of the fit, the corners first, shape (m, n, k).
+        columns: Jacobian of the fit, the corners first, shape (m, k, n).
         inverse: of its normal matrix, shape (m, k, k).
         residual: shape (m, n), of the fit.
         weight: shape (m, n).
-        shifts: change of the grey values by a shift of each grid line, pixels, along either axis, shapes (m, n, l).
-        place: (a - 1/2, b - 1/2) of each pixel in the marker, shape (m, n, 2).
+        shifts: change of the grey values by a shift of each grid line, pixels, of constant a and of b, shape (m, 2, l, n).
+        place: (a - 1/2, b - 1/2) of each pixel in the marker, shape (m, 2, n).
     """
-    along = place[..., 1, None] * _TURN, place[..., 0, None] * _TURN
-    G = np.concatenate([*shifts, shifts[0] * along[0], shifts[1] * along[1]], -1)
-    weighted = (G * weight[..., None]).transpose(0, 2, 1)
-    strength = (weighted @ G).astype(float)
-    cross = (weighted @ columns).astype(float)
+    m, _, lines, n = shifts.shape
+    G = np.empty((m, 2, 2, lines, n), np.float32)
+    G[:, 0] = shifts
+    np.multiply(shifts, (place[:, ::-1] * _TURN)[:, :, None], out=G[:, 1])
+    G = G.reshape(m, -1, n)
+    weighted = G * weight[:, None]
+    strength = (weighted @ G.transpose(0, 2, 1)).astype(float)
+    cross = (weighted @ columns.transpose(0, 2, 1)).astype(float)
     through = inverse @ cross.transpose(0, 2, 1)
     S = strength - cross @ through
     u = (weighted @ residual[..., None])[..., 0].astype(float)
@@ -68,7 +71,7 @@ def edge_errors(
     over = np.where(D > _LEAST_SHARE * D.max(1, keepdims=True), 1.0 / np.maximum(D, 1e-12), 0.0)
     seen = over > 0
     S = S * seen[:, :, None] * seen[:, None, :]
-    noise = _noise(S, u * seen, over, residual, weight, columns.shape[-1])
+    noise = _noise(S, u * seen, over, residual, weight, columns.shape[1])
     by_noise = np.einsum("mll,ml->m", S, over)
     by_lines = np.einsum("mlk,mlk,ml->m", S, S, over)
     off = ((u**2 * over).sum(1) - noise * by_noise) / noise

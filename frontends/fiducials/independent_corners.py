@@ -15,27 +15,31 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+_OWN = np.kron(np.eye(4), np.ones((2, 2)))
+"""Which entries of the covariance belong to one corner each."""
 
-def independent_scale(covariance: Float, corners: Float) -> float:
-    """Factor on the covariances of single corners where they are used as independent ones.
+
+def independent_scale(covariance: Float, corners: Float) -> Float:
+    """Factor on the covariances of single corners where they are used as independent ones, shape (...).
 
     Args:
-        covariance: of (x0, y0, x1, y1, ...), shape (8, 8), positive definite.
-        corners: shape (4, 2).
+        covariance: of (x0, y0, x1, y1, ...), shape (..., 8, 8), positive definite.
+        corners: shape (..., 4, 2).
     """
-    blocks = np.stack([covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] for k in range(4)])
     J = _affine(corners)
-    apart = np.concatenate([np.linalg.solve(block, J[2 * k : 2 * k + 2]) for k, block in enumerate(blocks)])
-    by_blocks = np.linalg.slogdet(J.T @ apart)[1]
-    by_all = np.linalg.slogdet(J.T @ np.linalg.solve(covariance, J))[1]
-    return float(np.exp((by_blocks - by_all) / 6.0))
+    apart = covariance * _OWN
+    of_both = J.swapaxes(-1, -2)[..., None, :, :] @ np.linalg.solve(
+        np.stack([apart, covariance], -3), J[..., None, :, :]
+    )
+    logarithm = np.linalg.slogdet(of_both)[1]
+    return np.exp((logarithm[..., 0] - logarithm[..., 1]) / 6.0)
 
 
 def _affine(corners: Float) -> Float:
-    """Change of the corners by a shift and a linear map of the marker about its middle, shape (8, 6)."""
-    away = corners - corners.mean(0)
-    away = away / np.sqrt((away**2).mean())
-    J = np.zeros((8, 6))
-    J[0::2, 0] = J[1::2, 3] = 1.0
-    J[0::2, 1:3] = J[1::2, 4:6] = away
+    """Change of the corners by a shift and a linear map of the marker about its middle, shape (..., 8, 6)."""
+    away = corners - corners.mean(-2, keepdims=True)
+    away = away / np.sqrt((away**2).mean((-2, -1), keepdims=True))
+    J = np.zeros((*corners.shape[:-2], 8, 6))
+    J[..., 0::2, 0] = J[..., 1::2, 3] = 1.0
+    J[..., 0::2, 1:3] = J[..., 1::2, 4:6] = away
     return J

@@ -116,7 +116,7 @@ def fit_patterns(
     order = np.argsort(np.concatenate([index for index, _ in groups]))
     solved = _Settled.together([part for _, part in groups], order)
     size = image.shape[1], image.shape[0]
-    return _summary(state, solved, pixels, pixel_noise(image, [surroundings(c, cells, size) for c in raw]))
+    return _summary(state, solved, pixels, pixel_noise(image, surroundings(raw, cells, size)))
 
 
 def _coarse(
@@ -180,7 +180,7 @@ class _Solved:
     """After the step."""
     weight: Single
     columns: Single
-    """Jacobian by all unknowns, the corners first."""
+    """Jacobian by all unknowns, the corners first, shape (m, k, n)."""
     model: PatternModel
     gain: Single
     """Change of the grey values by the pattern."""
@@ -195,25 +195,23 @@ class _Settled:
     residual: Single
     weight: Single
     columns: Single
-    shifts_a: Single
-    """Change of the grey values by a shift of each grid line of constant a, shape (m, n, k)."""
-    shifts_b: Single
+    shifts: Single
+    """Change of the grey values by a shift of each grid line of constant a, then of b, shape (m, 2, k, n)."""
     place: Single
-    """Of the pixels in the marker, from its middle, shape (m, n, 2)."""
+    """Of the pixels in the marker, from its middle, shape (m, 2, n)."""
 
     @property
     def jacobian(self) -> Single:
         """By the corners."""
-        return self.columns[..., :8]
+        return self.columns[:, :8]
 
     @staticmethod
     def of(solved: _Solved, which: NDArray[np.bool_]) -> "_Settled":
         """Some of the markers."""
-        model, gain = solved.model, solved.gain[..., None]
-        of_a, of_b = model.by_lines()
-        place = np.stack([model.a - 0.5, model.b - 0.5], -1)
+        shifts = solved.model.by_lines()
+        shifts *= solved.gain[:, None, None]
         parts = (solved.step, solved.inverse, solved.residual, solved.weight, solved.columns)
-        parts = (*parts, gain * of_a, gain * of_b, place)
+        parts = (*parts, shifts, solved.model.ab - np.float32(0.5))
         return _Settled(*(parts if which.all() else (part[which] for part in parts)))
 
     @staticmethod
@@ -271,22 +269,24 @@ def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px:
     tone = state.tone.astype(np.float32)[:, None]
     over = 1.0 / (1.0 + tone * model.T)
     response = (1.0 + tone) * model.T * over
-    columns = np.empty((*model.T.shape, _UNKNOWNS), np.float32)
-    u, v = model.a - 0.5, model.b - 0.5
+    u, v = model.ab[:, 0] - np.float32(0.5), model.ab[:, 1] - np.float32(0.5)
+    columns = np.empty((len(H), _UNKNOWNS, u.shape[1]), np.float32)
     for k, column in enumerate((1.0, response, u, v, response * u, response * v)):
-        columns[..., _LIGHT + k] = column
-    columns[..., _LIGHT + 6 :] = model.surround
+        columns[:, _LIGHT + k] = column
+    columns[:, _LIGHT + 6 :] = model.surround
     light, weight = state.light, pixels.weight
     if light is None:
-        light = _least_squares(columns[..., _LIGHT:], pixels.value, weight)[0]
-    residual = pixels.value - _times(columns[..., _LIGHT:], light)
-    gain = _times(np.stack([np.ones_like(u), u, v], -1), light[:, [1, 4, 5]])
-    columns[..., _TONE] = 0.0 if tone_fixed else gain * model.T * (1.0 - model.T) * over**2
-    gain = gain * (1.0 + tone) * over**2
-    columns[..., :8] = _by_corners(H, model, pixels.xy, gain)
-    columns[..., 8:_TONE] = gain[..., None] * model.by_blur
+        light = _least_squares(columns[:, _LIGHT:], pixels.value, weight)[0]
+    residual = pixels.value - _times(columns[:, _LIGHT:], light)
+    part = light.astype(np.float32)[:, :, None]
+    gain = part[:, 1] + part[:, 4] * u + part[:, 5] * v
+    over *= over
+    columns[:, _TONE] = 0.0 if tone_fixed else gain * model.T * (1.0 - model.T) * over
+    gain = gain * (1.0 + tone) * over
+    columns[:, :8] = _by_corners(H, model, pixels.xy, gain)
+    np.multiply(gain[:, None], model.by_blur, out=columns[:, 8:_TONE])
     if state.light is not None:
-        slope = gain * np.sqrt(np.einsum("mni,mni->mn", model.gradient, model.gradient))
+        slope = gain * np.sqrt(np.einsum("mxn,mxn->mn", model.gradient, model.gradient))
         weight = weight * _softened(residual, _robust_scale(residual, weight), forgiven_px * slope)
     step, inverse = _least_squares(columns, residual, weight)
     after = residual - _times(columns, step)
@@ -297,32 +297,35 @@ def _solve(state: _State, pixels: Pixels, D: Single, lines: Single, forgiven_px:
 def _by_corners(H: Float, model: PatternModel, xy: Single, gain: Single) -> Single:
     """Derivative of the grey value by the eight corner coordinates: the pattern moves, the pixel stays."""
     h = H.astype(np.float32)
-    over_q = -gain / (model.a * h[:, None, 2, 0] + model.b * h[:, None, 2, 1] + h[:, None, 2, 2])
-    gx, gy = over_q * model.gradient[..., 0], over_q * model.gradient[..., 1]
-    along = -(gx * xy[..., 0] + gy * xy[..., 1])
-    a, b = model.a, model.b
-    by_H = np.stack([gx * a, gx * b, gx, gy * a, gy * b, gy, along * a, along * b], -1)
-    return by_H @ corner_basis(H).astype(np.float32)
+    over_q = -gain / ((h[:, None, 2, :2] @ model.ab)[:, 0] + h[:, 2, 2, None])
+    by_H = np.empty((len(H), 8, xy.shape[-1]), np.float32)
+    np.multiply(over_q[:, None], model.gradient, out=by_H[:, 2:6:3])
+    along = -np.einsum("mxn,mxn->mn", by_H[:, 2:6:3], xy)
+    np.multiply(by_H[:, 2:3], model.ab, out=by_H[:, :2])
+    np.multiply(by_H[:, 5:6], model.ab, out=by_H[:, 3:5])
+    np.multiply(along[:, None], model.ab, out=by_H[:, 6:])
+    return corner_basis(H).astype(np.float32).transpose(0, 2, 1) @ by_H
 
 
 def _bounded(blur: Float, step: Float, least_px: float) -> Float:
     """The blur after a step, its widths kept within what lenses and hands do."""
     new = blur + np.clip(step, -_BLUR_STEP_PX2, _BLUR_STEP_PX2)
-    matrix = new[:, [[0, 2], [2, 1]]]
-    values, vectors = np.linalg.eigh(matrix)
-    values = np.clip(values, least_px**2, _BLUR_RANGE_PX[1] ** 2)
-    matrix = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
-    return np.stack([matrix[:, 0, 0], matrix[:, 1, 1], matrix[:, 0, 1]], -1)
+    middle, half = (new[:, 0] + new[:, 1]) / 2, (new[:, 0] - new[:, 1]) / 2
+    radius = np.hypot(half, new[:, 2])
+    high, low = (np.clip(middle + sign * radius, least_px**2, _BLUR_RANGE_PX[1] ** 2) for sign in (1, -1))
+    shrink = (high - low) / np.maximum(2.0 * radius, 1e-12)
+    middle, half = (high + low) / 2, half * shrink
+    return np.stack([middle + half, middle - half, new[:, 2] * shrink], -1)
 
 
 def _times(columns: Single, factors: Float) -> Single:
-    return (columns @ factors.astype(np.float32)[..., None])[..., 0]
+    return (factors.astype(np.float32)[:, None] @ columns)[:, 0]
 
 
 def _least_squares(columns: Single, value: Single, weight: Single) -> tuple[Float, Float]:
     """Weighted solutions (m, k) and the inverse normal matrices (m, k, k), with columns scaled to be safe."""
-    weighted = (columns * weight[..., None]).transpose(0, 2, 1)
-    normal = (weighted @ columns).astype(float)
+    weighted = columns * weight[:, None]
+    normal = (weighted @ columns.transpose(0, 2, 1)).astype(float)
     right = (weighted @ value[..., None]).astype(float)
     norm = np.sqrt(np.einsum("mkk->mk", normal)) + 1e-6
     outer = norm[:, :, None] * norm[:, None, :]
@@ -357,9 +360,7 @@ def _summary(state: _State, solved: _Settled, pixels: Pixels, noise: Float) -> P
     weight, light = solved.weight, solved.step[:, _LIGHT:]
     freedom = np.maximum(weight.sum(1) - _UNKNOWNS, 1.0)
     variance = np.maximum((solved.residual**2 * weight).sum(1) / freedom, _ROUNDING**2)
-    edges = edge_errors(
-        solved.columns, solved.inverse, solved.residual, weight, (solved.shifts_a, solved.shifts_b), solved.place
-    )
+    edges = edge_errors(solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place)
     last_step = np.abs(solved.step[:, :8]).max(1)
     by_noise = solved.inverse[:, :8, :8] * edges.noise_variance[:, None, None]
     covariance = by_noise + edges.variance_px2 * edges.spread
@@ -385,6 +386,6 @@ def _structure(solved: _Settled, covariance: Float, noise: Float) -> Float:
 
 
 def _share(solved: _Settled, pixels: Pixels) -> Float:
-    strength = np.einsum("mnk,mnk->mn", solved.jacobian, solved.jacobian)
+    strength = np.einsum("mkn,mkn->mn", solved.jacobian, solved.jacobian)
     whole = (strength * pixels.weight).sum(1)
     return ((strength * solved.weight).sum(1) / np.maximum(whole, 1e-9)).astype(float)

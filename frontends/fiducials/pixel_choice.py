@@ -30,6 +30,7 @@ class Pixels:
     origin: Float
     """Shape (m, 2): near the marker, taken off the positions to keep single precision fine."""
     xy: Single
+    """Shape (m, 2, n)."""
     value: Single
     weight: Single
 
@@ -77,27 +78,33 @@ def choose_pixels(
     value = image.reshape(-1)[flat].astype(np.float32).reshape(m, n)
     if positions is None:
         rows = index // width
-        xy = np.stack([index - rows * width, rows], -1)
+        xy = np.stack([index - rows * width, rows], 1)
     else:
-        xy = positions.reshape(-1, 2)[flat].reshape(m, n, 2)
-    return Pixels(origin, (xy - origin[:, None]).astype(np.float32), value, weight)
+        xy = positions.reshape(-1, 2)[flat].reshape(m, n, 2).transpose(0, 2, 1)
+    return Pixels(origin, np.ascontiguousarray(xy - origin[..., None], np.float32), value, weight)
 
 
 def _near_edges(raw: Float, patterns: list[Float], choice: Choice) -> Float:
-    """Places on both sides of the edges of each marker, shape (m, n, 2), in the image."""
-    H = homography(raw)
-    samples = np.stack([_samples(p.tobytes(), len(p), round(_SPARE * choice.most)) for p in patterns])
-    place, across, aside = samples[..., :2], samples[..., 2:4], samples[..., 4:]
-    u = np.linalg.norm(raw[:, 1] - raw[:, 0] + raw[:, 2] - raw[:, 3], axis=1) / 2
-    v = np.linalg.norm(raw[:, 3] - raw[:, 0] + raw[:, 2] - raw[:, 1], axis=1) / 2
-    cell = 1.0 / np.array([len(p) for p in patterns])
-    reach = np.minimum(choice.reach_px[:, None] / np.stack([u, v], -1), _MARGIN_CELLS * cell[:, None])
-    ab = place + across * (aside * reach[:, None])
-    q = ab @ H[:, :, :2].transpose(0, 2, 1) + H[:, None, :, 2]
-    return q[..., :2] / np.where(q[..., 2:] > 0, q[..., 2:], np.nan)
+    """Places on both sides of the edges of each marker, shape (m, 2, n), in the image."""
+    H = homography(raw).astype(np.float32)
+    samples = _samples_of(tuple(p.tobytes() for p in patterns), len(patterns[0]), round(_SPARE * choice.most))
+    sides = np.linalg.norm(raw[:, [1, 3]] - raw[:, :1] + raw[:, 2:3] - raw[:, [3, 1]], axis=2) / 2
+    cell = 1.0 / len(patterns[0])
+    reach = np.minimum(choice.reach_px[:, None] / sides, _MARGIN_CELLS * cell).astype(np.float32)
+    q = H[:, :, :2] @ (samples[:, :2] + samples[:, 2:] * reach[:, :, None])
+    q += H[:, :, 2:]
+    q[:, 2][q[:, 2] <= 0] = np.nan
+    return q[:, :2] / q[:, 2:]
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=256)
+def _samples_of(patterns: tuple[bytes, ...], cells: int, count: int) -> Single:
+    """Of several patterns, see `_samples`: places, and shifts off the edge in units of the reach; shape (m, 4, n)."""
+    samples = np.stack([_samples(pattern, cells, count) for pattern in patterns])
+    parts = samples[..., :2], samples[..., 2:4] * samples[..., 4:]
+    return np.ascontiguousarray(np.concatenate(parts, -1).transpose(0, 2, 1), np.float32)
+
+
 def _samples(pattern: bytes, cells: int, count: int) -> Float:
     """Points along the edges of a pattern: place (2) in the unit square, unit vector across (2), and how far (1) in
     units of the reach, -1 to 1. Shape (count, 5). Evenly spread by the golden ratio (a Kronecker sequence)."""
@@ -116,11 +123,13 @@ def _samples(pattern: bytes, cells: int, count: int) -> Float:
 
 
 def _distinct(places: Float, shape: tuple[int, ...], most: int) -> list[NDArray[np.int64]]:
-    """Flat indices of the pixels that places (m, n, 2) fall on, in order, each once, in the image, not too many."""
+    """Flat indices of the pixels that places (m, 2, n) fall on, in order, each once, in the image, not too many."""
     height, width = shape[:2]
     near = np.rint(places)
-    inside = (near[..., 0] >= 0) & (near[..., 1] >= 0) & (near[..., 0] < width) & (near[..., 1] < height)
-    flat = np.where(inside, near[..., 1] * width + near[..., 0], -1.0).astype(np.int64)
+    x, y = near[:, 0], near[:, 1]
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    # in double precision: a large image has more pixels than single precision has whole numbers
+    flat = np.where(inside, y.astype(float) * width + x, -1.0).astype(np.int64)
     flat.sort(axis=1)
     first = flat >= 0
     first[:, 1:] &= flat[:, 1:] != flat[:, :-1]
@@ -142,10 +151,11 @@ def _edges(pattern: Float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     return across, along
 
 
-def surroundings(corners: Float, cells: int, size: tuple[int, int]) -> Window:
-    """x0, y0, x1, y1 (exclusive) round a marker and a little more than a cell, within an image (width, height)."""
-    diagonal = max(np.linalg.norm(corners[2] - corners[0]), np.linalg.norm(corners[3] - corners[1]))
-    grow = diagonal / cells + 2.0
-    low, high = np.nan_to_num(corners.min(0) - grow), np.nan_to_num(corners.max(0) + grow)
-    x0, y0 = max(int(low[0]), 0), max(int(low[1]), 0)
-    return x0, y0, min(int(high[0]) + 2, size[0]), min(int(high[1]) + 2, size[1])
+def surroundings(corners: Float, cells: int, size: tuple[int, int]) -> list[Window]:
+    """x0, y0, x1, y1 (exclusive) round each marker (m, 4, 2) and a little more than a cell, within an image of a size
+    (width, height)."""
+    diagonal = np.hypot(*(corners[:, 2:] - corners[:, :2]).transpose(2, 0, 1)).max(1)
+    grow = (diagonal / cells + 2.0)[:, None]
+    low = np.maximum(np.nan_to_num(corners.min(1) - grow).astype(int), 0)
+    high = np.minimum(np.nan_to_num(corners.max(1) + grow).astype(int) + 2, size)
+    return [(x0, y0, x1, y1) for (x0, y0), (x1, y1) in zip(low.tolist(), high.tolist(), strict=True)]

@@ -77,11 +77,11 @@ class MarkerSearch:
         if not corners:
             self._window = None
             return
-        sides = [np.linalg.norm(c - np.roll(c, 1, axis=0), axis=1).mean() for c in corners]
-        points = np.concatenate(corners)
-        points = points[np.isfinite(points).all(1)]
-        self._smallest = float(min(sides))
-        margin = max(20.0, 0.6 * max(sides))
+        quads = np.stack(corners)
+        sides = np.hypot(*np.moveaxis(quads - quads[:, [3, 0, 1, 2]], -1, 0)).mean(1)
+        points = quads[np.isfinite(quads).all(2)]
+        self._smallest = float(sides.min())
+        margin = max(20.0, 0.6 * float(sides.max()))
         low, high = np.floor(points.min(0) - margin).astype(int), np.ceil(points.max(0) + margin).astype(int)
         self._window = (
             max(int(low[0]), 0),

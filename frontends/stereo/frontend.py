@@ -1,5 +1,7 @@
 """The stereo front end: one pair in, one `StereoFrame` out."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,8 @@ from .tracks import Int, Tracks, no_tracks
 from .vertical import VerticalCorrection
 
 Bool = NDArray[np.bool_]
+Early = Callable[[Float, int], object]
+"""Takes `last_T_this` (4, 4) by the flow alone and its number of inliers, while a keyframe is still in the making."""
 
 _FADING = 0.7
 """Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
@@ -74,13 +78,22 @@ class StereoFrontEnd:
         """Shape (4, 4): the last keyframe's pose in the front end's own chain, corrected where places come back."""
         return self._chain_T_keyframe.copy()
 
-    def process(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> StereoFrame:
+    def process(
+        self,
+        stamp_ns: int,
+        left: NDArray[np.generic],
+        right: NDArray[np.generic],
+        wanted: bool = False,
+        early: Early | None = None,
+    ) -> StereoFrame:
         """Tracks the features into this pair.
 
         Args:
             stamp_ns: time of the pair, later than that of the pair before.
             left: image (h, w) or (h, w, 3), 8 bit.
             right: the same size.
+            wanted: its place matters, so it becomes a keyframe; plain flow drifts, alike for all features.
+            early: told of a keyframe's motion before the work on it begins, which takes ten times as long.
         """
         pair = prepare(stamp_ns, left, right)
         if self._last is None:
@@ -93,8 +106,10 @@ class StereoFrontEnd:
         if motion is None:
             return self._recover(pair, guess)
         pose = motion.reference_T_this
-        if self._wants_keyframe(left_px, pose) is None:
+        if not wanted and self._wants_keyframe(left_px, pose) is None:
             return self._plain_frame(pair, left_px, motion)
+        if early is not None:
+            early(inverse(self._keyframe_T_last) @ pose, int(motion.inliers.sum()))
         return self._keyframe(pair, pose) or self._recover(pair, pose)
 
     def relocalise(self, stamp_ns: int, left: NDArray[np.generic], right: NDArray[np.generic]) -> list[Relocalisation]:

@@ -165,6 +165,10 @@ class LiveUpdate:
     """Of the whole process: received, dropped, malformed, ... by source, queue and sink."""
     robot_frame: str = "b"
     """Frame of the points: `b`, or `b1`, ... once the base has been moved."""
+    points_stamp_ns: int = 0
+    """Up to when measurements are in the points; 0 while nothing is known."""
+    points_covariance_m2: Float | None = None
+    """Shape (3 n, 3 n), of all points together in their order: they share the errors of machine and calibration."""
 
 
 @dataclass(frozen=True, slots=True)

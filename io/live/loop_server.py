@@ -10,14 +10,14 @@ from .access import Access, cannot_listen
 from .commands import CommandDesk
 from .interfaces import LiveImage, LiveUpdate, OnCommand
 from .loop import LoopThread, Mailbox
-from .outbox import Outbox
+from .outbox import Outbox, ThroughOutbox
 from .tally import Tally
 
 Listener = TypeVar("Listener")
 _CLOSE_S = 3.0
 
 
-class LoopServer(ABC, Generic[Listener]):
+class LoopServer(ThroughOutbox, ABC, Generic[Listener]):
     """A sink that clients connect to.
 
     Args:
@@ -80,12 +80,6 @@ class LoopServer(ABC, Generic[Listener]):
             self._loop.stop()
             raise cannot_listen(self._access.host, self._port, error) from error
         self._outbox.start()
-
-    def publish(self, update: LiveUpdate) -> None:
-        self._outbox.publish(update)
-
-    def image(self, image: LiveImage) -> None:
-        self._outbox.image(image)
 
     def stop(self) -> None:
         self._outbox.stop()

@@ -12,6 +12,20 @@ _STOP_S = 1.0
 UPDATES = "updates"
 
 
+class ThroughOutbox:
+    """A sink that hands everything to its outbox."""
+
+    _outbox: "Outbox"
+
+    def publish(self, update: LiveUpdate) -> None:
+        """See `interfaces.Sink`."""
+        self._outbox.publish(update)
+
+    def image(self, image: LiveImage) -> None:
+        """See `interfaces.Sink`."""
+        self._outbox.image(image)
+
+
 class Outbox:
     """Hands updates and images to `send` in a thread of its own.
 

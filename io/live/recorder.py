@@ -11,7 +11,7 @@ from typing import BinaryIO, cast
 from ...factors.errors import LogError
 from ..writer import McapSink
 from .interfaces import LiveImage, LiveUpdate, OnCommand
-from .outbox import Outbox
+from .outbox import Outbox, ThroughOutbox
 from .tally import Tally
 from .views import Entry, image_message, ros_messages
 
@@ -19,7 +19,7 @@ OpenFile = Callable[[Path], BinaryIO]
 _RETRY_S = 2.0
 
 
-class Recorder:
+class Recorder(ThroughOutbox):
     """An MCAP file of ROS 2 messages; every second its chunk is closed and the file is synchronised with the disk.
 
     When the disk is full (or the file cannot be written for another reason) the part that was written stays readable,
@@ -88,12 +88,6 @@ class Recorder:
             reason = error.strerror or str(error)
             raise LogError(f"{self._path}: cannot be created ({reason}); choose another place for it") from error
         self._outbox.start()
-
-    def publish(self, update: LiveUpdate) -> None:
-        self._outbox.publish(update)
-
-    def image(self, image: LiveImage) -> None:
-        self._outbox.image(image)
 
     def stop(self) -> None:
         self._outbox.stop()

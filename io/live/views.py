@@ -96,6 +96,8 @@ def json_object(update: LiveUpdate) -> dict[str, Any]:
         "age_s": _finite(update.age_s),
         "health": health_object(update.health),
         "points": [_point(point, update.robot_frame) for point in update.points],
+        "points_stamp_ns": update.points_stamp_ns,
+        "points_covariance_m2": None if update.points_covariance_m2 is None else _plain(update.points_covariance_m2),
         "poses": poses,
     }
 

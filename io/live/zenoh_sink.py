@@ -11,13 +11,13 @@ from ...factors.errors import LogError
 from ..schemas import typestore
 from .backoff import Backoff
 from .interfaces import Clock, LiveImage, LiveUpdate, OnCommand
-from .outbox import Outbox
+from .outbox import Outbox, ThroughOutbox
 from .tally import Tally
 from .views import ros_messages
 from .zenoh_link import DEFAULT_ROUTER, Announcements, Attachment, check_router, key_of, open_session
 
 
-class ZenohSink:
+class ZenohSink(ThroughOutbox):
     """Publishes what a recording would hold, announced so that ROS 2 tools list the topics.
 
     What cannot be sent at once is dropped by zenoh; without a router everything is dropped and counted.
@@ -52,9 +52,6 @@ class ZenohSink:
         self._linking = threading.Thread(target=self._connect, name="surecut-zenoh-link", daemon=True)
         self._linking.start()
         self._outbox.start()
-
-    def publish(self, update: LiveUpdate) -> None:
-        self._outbox.publish(update)
 
     def image(self, image: LiveImage) -> None:
         """Images come from there."""

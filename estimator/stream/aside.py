@@ -1,0 +1,109 @@
+"""Work that only looks at the state, done by a copy of the process, so that nobody waits for it.
+
+A copy (fork) sees everything as it stood at that moment, costs no time to make, and cannot change anything here. GTSAM
+holds the interpreter while it works, so that a thread would not do.
+"""
+
+import contextlib
+import os
+import pickle
+import select
+import signal
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+Made = TypeVar("Made")
+
+NICENESS = 4
+"""Below the process itself."""
+BLOCK = 1 << 16
+
+
+class Aside(Generic[Made]):
+    """One piece of work at a time.
+
+    Args:
+        apart: in a copy; else at once and here, as where the system has no fork.
+    """
+
+    def __init__(self, apart: bool) -> None:
+        self._apart = apart and hasattr(os, "fork")
+        self._pid = 0
+        self._end = -1
+        self._said = b""
+        self._result: list[Made | Exception] = []
+
+    def busy(self) -> bool:
+        """Is a piece of work under way, or its result not taken yet?"""
+        return self._pid != 0 or bool(self._result)
+
+    def begin(self, work: Callable[[], Made]) -> None:
+        """Starts a piece of work; its result, or what it raises, must be something that can be pickled."""
+        assert not self.busy()
+        if not self._apart:
+            self._result.append(_done(work))
+            return
+        self._end, theirs = os.pipe()
+        self._said = b""
+        self._pid = os.fork()
+        if self._pid == 0:
+            _copy(work, theirs)
+        os.close(theirs)
+
+    def taken(self) -> Made | None:
+        """The result, once; None while there is none.
+
+        Raises:
+            Exception: what the work has raised.
+        """
+        self._read()
+        if not self._result:
+            return None
+        found = self._result.pop()
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def stop(self) -> None:
+        """Ends what is under way."""
+        if self._pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._pid, signal.SIGKILL)
+            self._close()
+        self._result.clear()
+
+    def _read(self) -> None:
+        while self._pid and select.select([self._end], [], [], 0.0)[0]:
+            block = os.read(self._end, BLOCK)
+            self._said += block
+            if not block:
+                self._close()
+                self._result.append(_understood(self._said))
+
+    def _close(self) -> None:
+        os.close(self._end)
+        os.waitpid(self._pid, 0)
+        self._pid, self._end = 0, -1
+
+
+def _done(work: Callable[[], Made]) -> Made | Exception:
+    try:
+        return work()
+    except Exception as error:
+        return error
+
+
+def _copy(work: Callable[[], object], end: int) -> None:
+    """The copy's life; it never returns."""
+    try:
+        os.nice(NICENESS)
+        said = pickle.dumps(_done(work))
+        while said:
+            said = said[os.write(end, said) :]
+    finally:
+        os._exit(0)  # no handlers, no buffers: they are the original's
+
+
+def _understood(said: bytes) -> Any:
+    """From our own copy: nothing that comes from outside is ever unpickled."""
+    return pickle.loads(said) if said else RuntimeError("a copy of the process died at its work; is there memory?")

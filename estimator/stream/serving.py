@@ -1,0 +1,58 @@
+"""The life of a front end's process: what comes is taken, and orders are handed on."""
+
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import cv2
+
+from ...io.messages import Message
+from .parent import end_with_parent, give_way, keep_loaded
+from .wire import Died, Order, Ready
+
+
+class FrontEnd(Protocol):
+    """What does the work."""
+
+    @property
+    def calibrations(self) -> Mapping[str, Message]:
+        """Messages by topic that a fresh start has to be told again."""
+        ...
+
+    def take(self, item: Any, /) -> None:
+        """One item of the queue; whatever is wrong with it is told."""
+        ...
+
+
+def serve(
+    who: str,
+    niceness: int,
+    made: Callable[[Mapping[str, Message]], FrontEnd],
+    inbox: Any,
+    onward: Any,
+    out: Any,
+) -> None:
+    """Until the order to finish. `inbox` and `onward` are queues between processes, `out` the line to the parent.
+
+    Args:
+        made: a front end that begins, told the calibrations that are known.
+    """
+    end_with_parent()
+    keep_loaded()
+    give_way(niceness)
+    cv2.setNumThreads(1)
+    try:
+        loop = made({})
+        out.put(Ready(who))
+        while True:
+            item = inbox.get()
+            if not isinstance(item, Order):
+                loop.take(item)
+                continue
+            onward.put(item)
+            if item.what == "finish":
+                return
+            if item.what == "reset":
+                loop = made(loop.calibrations)
+    except Exception:
+        out.put(Died(who, traceback.format_exc()))

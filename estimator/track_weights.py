@@ -1,0 +1,129 @@
+"""Not all tracks are equally good: each gets the variance that its own residuals show.
+
+A feature may be no point at all: the outline of a pipe before a wall, a highlight, the crossing of an edge with another
+one behind it. It wanders as the view changes, by more than its patches tell. Such a track is wrong in all of its views,
+and where it is near, hence heavy, the estimate follows it and leaves it small residuals. So the residuals of a whole
+track count as the others foretell them (Baarda 1968), and its variance is drawn from an inverse gamma distribution,
+whose width this log's tracks tell: errors with a multivariate t distribution (Lange, Little and Taylor 1989).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from ..factors import keys
+from .correlation import CAMERAS, Active
+from .linear import DETERMINED, LinearSystem
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+FEWEST_TRACKS = 40
+"""Tracks that tell how much their variances differ."""
+WIDTHS = (1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 25.0, 60.0)
+"""Degrees of freedom of the distribution of variances that are tried: from tracks of all kinds to tracks all alike."""
+ALIKE = 60.0
+SCALES = np.exp(np.linspace(-0.5, 0.7, 25))
+"""Typical variances that are tried, about the median of what the tracks show."""
+MOST = 1.5
+"""A track counts for so much more than stated at most: few residuals may be small by chance."""
+ROUNDS = 2
+"""A heavy track's residuals grow when it is no longer followed."""
+
+Views = list[tuple[int, Int]]
+"""Landmark, and the positions of its factors in the system."""
+
+
+def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int, float]:
+    """Information of each track over what it states, by the positions of its factors. Empty: the tracks are alike.
+
+    Args:
+        active: all factors of a system.
+        system: their system, at its solution.
+        family: whose tracks are meant.
+    """
+    tracks = _views(active, family)
+    if len(tracks) < FEWEST_TRACKS:
+        return {}
+    weight = np.ones(len(tracks))
+    spread: tuple[float, float] | None = None
+    for _ in range(ROUNDS):
+        chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
+        spread = spread or spread_of_variances(chi2, dof)
+        width, scale = spread
+        if width >= ALIKE:
+            return {}
+        weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
+    return {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}
+
+
+def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> LinearSystem:
+    root = np.ones(len(system.b))
+    for (_, positions), w in zip(tracks, weight, strict=True):
+        root[_rows(system, positions)] = np.sqrt(w)
+    return system.weighed_rows(root)
+
+
+def spread_of_variances(chi2: Float, dof: Float) -> tuple[float, float]:
+    """Degrees of freedom and typical value of the inverse gamma distribution of variances, by maximum likelihood.
+
+    Args:
+        chi2: shape (n,), of every track.
+        dof: shape (n,).
+    """
+    ratio = np.maximum(chi2 / dof, 1e-6)
+    scales = float(np.median(ratio)) * SCALES
+    likelihood = [[float(_log_f(ratio / s, dof, w).sum() - len(dof) * np.log(s)) for s in scales] for w in WIDTHS]
+    best = np.unravel_index(int(np.argmax(likelihood)), (len(WIDTHS), len(scales)))
+    return WIDTHS[int(best[0])], float(scales[int(best[1])])
+
+
+def _log_f(x: Float, d: Float, w: float) -> Float:
+    """Logarithm of the density of Fisher's F distribution with d and w degrees of freedom."""
+    beta = gammaln(0.5 * (d + w)) - gammaln(0.5 * d) - gammaln(0.5 * w)
+    return beta + 0.5 * d * np.log(d / w) + (0.5 * d - 1.0) * np.log(x) - 0.5 * (d + w) * np.log1p(d * x / w)
+
+
+def _views(active: Active, family: str) -> Views:
+    views: dict[int, list[int]] = {}
+    for position, (_, factor, record) in enumerate(active):
+        if record.family == family and record.camera in CAMERAS:
+            views.setdefault(next(k for k in factor.keys() if keys.kind(k) == "l"), []).append(position)
+    return [(landmark, np.array(positions)) for landmark, positions in views.items()]
+
+
+def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Float]:
+    """Squared residuals (n,) of whole tracks in units of their covariance, and their degrees of freedom (n,).
+
+    Any place of the landmark would do, and what the track itself does to the estimate is taken out.
+    """
+    place, covariance = system.rest_covariance()
+    found = np.array([_residual(p, system.columns[key], system, place, covariance) for key, p in tracks])
+    return found[:, 0], np.maximum(found[:, 1], 1e-3)
+
+
+def _residual(
+    positions: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float | None
+) -> tuple[float, float]:
+    """`z^T (I - H)^-1 z` of what is left of the residuals when the landmark is eliminated, and its dimension."""
+    rows = _rows(system, positions)
+    part = system.A[rows]
+    columns = np.unique(part.indices)
+    dense = np.zeros((len(rows), len(columns)))
+    dense[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), np.searchsorted(columns, part.indices)] = part.data
+    own = (columns >= landmark.start) & (columns < landmark.stop)
+    free = np.linalg.qr(dense[:, own], mode="complete")[0][:, int(own.sum()) :].T
+    z = free @ system.b[rows]
+    if covariance is None:
+        return float(z @ z), float(len(z))
+    at, B = place[columns[~own]], free @ dense[:, ~own]
+    hat = B @ covariance[np.ix_(at, at)] @ B.T
+    eigenvalues, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
+    known = eigenvalues > DETERMINED
+    along = (vectors.T @ z)[known]
+    return float((along**2 / eigenvalues[known]).sum()), float(known.sum())
+
+
+def _rows(system: LinearSystem, positions: Int) -> Int:
+    """Two for every factor."""
+    return (system.starts[positions][:, None] + np.arange(2)).ravel()
