@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 OUTLIER_SIGMA = 4.5
 """Residuals beyond it (probability of one dimension) are outliers: one in 150 000 by chance."""
 
-SNOOPED = ("depth cloud", "pipe outline", "picks")
+SNOOPED = ("depth cloud", "pipe outline", "pipe width", "picks")
 """Families of few measurements, each of which may hold a degree of freedom almost alone."""
 SNOOPING_SIGMA = 3.7
 SNOOPING_ROUNDS = 8

@@ -69,14 +69,14 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     """
     if not engine.boards.any_known() or engine.graph.unsolved:
         return None
-    log, values = engine.solver.log, engine.state.values
-    graph = log.graph()
-    if solution is not None:
-        values, graph = solution.values, solution.at.graph()
+    if solution is None:
+        prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
+    else:
+        prior = gaussian_of(solution.at.graph(), solution.values, long_lived(solution.values))
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
-        prior=gaussian_of(graph, values, long_lived(values)),
+        prior=prior,
         cameras=dict(engine.cameras),
         boards=[
             {
