@@ -20,7 +20,7 @@ from ...factors.camera import CameraModel
 from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
 from ...io.reader import LogReader
-from ..batch import BatchSolution, without_factors
+from ..batch import BatchSolution
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
@@ -72,7 +72,9 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     if solution is None:
         prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
     else:
-        graph = without_factors(engine.solver.log, set(solution.outliers))
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor, _ in solution.at.active:  # as the solution weighs them
+            graph.add(factor)
         prior = gaussian_of(graph, solution.values, long_lived(solution.values))
     return Memory(
         stamp_ns=engine.end_ns,
