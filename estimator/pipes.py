@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.measurements import OutlineSighting, Pick, Rejection
-from ..factors.noise import gaussian, robust, sigmas
+from ..factors.noise import floored, gaussian, robust, sigmas
 from ..factors.pipe import (
     axis_gauge,
     inset_prior,
@@ -26,12 +26,17 @@ Float = NDArray[np.float64]
 
 FAMILY = "picks"
 OUTLINE = "pipe outline"
+WIDTH = "pipe width"
 AXIS_ROLES = ("cut", "grasp")
 MINIMUM_PARALLAX_RAD = 0.03
 """Below it two rays do not place a point well enough to start from."""
 WIDE_RADIUS_M = (0.05, 0.04)
 """Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
 GAUGE_HALF_LENGTH_M = 0.25
+LEAST_SPAN_M = 0.1
+"""Two picks nearer to each other give no direction."""
+PART_M = 0.1
+"""A pipe is taken to go on so far beyond its picks."""
 EDGE_FLOOR_PX = 0.3
 """Shading and a background of like brightness move an edge: rms on rendered recordings, beyond what its fit says."""
 INSET_SHARE = 0.05
@@ -162,7 +167,7 @@ class Pipes:
         return where.o_T_c.translation(), direction / np.linalg.norm(direction)
 
     def _observe(self, point: _Point, where: SeenFrom, pick: Pick, update: Update) -> None:
-        covariance = pick.covariance_px2 + np.eye(2) * self._rig.noise.pick_floor_px**2
+        covariance = floored(pick.covariance_px2, self._rig.noise.pick_floor_px)
         model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
         key = keys.point(point.index)
         if pick.camera == "b_rgb":
@@ -341,6 +346,44 @@ class Pipes:
         i = cylinder.index
         radius = float(self._state.vector(keys.radius(i))[0])
         return self._state.point(keys.axis_start(i)), self._state.point(keys.axis_end(i)), radius
+
+    def known_part(self, pipe_id: str) -> tuple[Float, Float] | None:
+        """The part of a pipe's axis about its picks, {o}: by its cylinder, or before there is one by two picks."""
+        places, axis = self.places(pipe_id), self.axis(pipe_id)
+        if axis is not None:
+            start, direction = axis[0], axis[1] - axis[0]
+        else:
+            spans = [place - places[0] for place in places[1:]]
+            direction = max(spans, key=lambda span: float(np.linalg.norm(span)), default=np.zeros(3))
+            if np.linalg.norm(direction) < LEAST_SPAN_M:
+                return None
+            start = places[0]
+        direction = direction / np.linalg.norm(direction)
+        along = [float((p - start) @ direction) for p in places] or [0.0]
+        return start + (min(along) - PART_M) * direction, start + (max(along) + PART_M) * direction
+
+    def width(self, pipe_id: str, radius_m: float, sigma_m: float, stamp_ns: int) -> Update:
+        """A radius that was measured by something else than edges; empty while there is no cylinder."""
+        update, cylinder = Update(), self.cylinders.get(pipe_id)
+        if cylinder is not None and cylinder.known:
+            record = Record(WIDTH, "texture beside the pipe", stamp_ns, f"width of {pipe_id} by texture")
+            model = robust(sigmas([sigma_m]), self._rig.gates.robust_sigma)
+            update.add(gtsam.PriorFactorVector(keys.radius(cylinder.index), np.array([radius_m]), model), record)
+        return update
+
+    def outlined_of(self, pipe_id: str) -> list[tuple[SeenFrom, OutlineSighting]]:
+        """Outlines of one pipe that are in the graph."""
+        return [(where, seen) for where, seen in self.outlined if seen.pipe_id == pipe_id]
+
+    def take_back(self, pipe_id: str, stamps: set[int]) -> None:
+        """Outlines that leave the graph again."""
+        before = len(self.outlined)
+        self.outlined = [p for p in self.outlined if not (p[1].pipe_id == pipe_id and p[1].stamp_ns in stamps)]
+        self.cylinders[pipe_id].outlines -= before - len(self.outlined)
+
+    def named(self) -> list[str]:
+        """Pipes that something is known of."""
+        return list(dict.fromkeys([*self.cylinders, *(p.pipe for p in self.points.values() if p.pipe is not None)]))
 
     def places(self, pipe_id: str) -> list[Float]:
         """Points on a pipe as believed now, in {o}."""
