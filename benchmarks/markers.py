@@ -95,8 +95,9 @@ def measure(setting: Setting, seconds: float) -> None:
             used += 1e3 * (time.process_time() - busy)
     wall = np.array(walls[len(order) :])
     kind = "pair" if setting.stereo else "image"
+    lens = "distorted" if setting.distorted else "pinhole"
     print(
-        f"{setting.width}x{setting.height} {kind}, {setting.depth_m} m, {'distorted' if setting.distorted else 'pinhole'}: "
+        f"{setting.width}x{setting.height} {kind}, {setting.depth_m} m, {lens}: "
         f"mean {wall.mean():.1f}, median {np.median(wall):.1f}, 95 % {np.quantile(wall, 0.95):.1f} ms; "
         f"processor {used / len(walls):.1f} ms; markers {np.mean(found):.1f}",
         flush=True,

@@ -66,23 +66,26 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             values, more = optimum(without_factors(log, off), at.values)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
-    at, more = _with_track_weights(log, off, at, robust_sigma)
-    at = with_correlated_tracks(at, ODOMETRY)
+    at, more, slack = _with_track_weights(log, off, at, robust_sigma)
+    at = with_correlated_tracks(at, ODOMETRY, slack)
     iterations += more
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
-def _with_track_weights(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[Linearised, int]:
-    """The optimum with tracks weighed by what they are worth, and the iterations to there."""
+def _with_track_weights(
+    log: FactorLog, off: set[int], at: Linearised, robust_sigma: float
+) -> tuple[Linearised, int, float]:
+    """The optimum with tracks weighed by what they are worth, the iterations to there, and the weights' slack."""
+    weights = track_weights(at.active, at.system, ODOMETRY)
+    if not weights.by_position:
+        return at, 0, 1.0
     factors = {}
-    for position, weight in track_weights(at.active, at.system, ODOMETRY).items():
+    for position, weight in weights.by_position.items():
         index, factor, record = at.active[position]
         factors[index] = reweighed(factor, record.camera or "", weight, robust_sigma)
-    if not factors:
-        return at, 0
     weighed = log.replaced(factors)
     values, iterations = optimum(without_factors(weighed, off), at.values)
-    return linearise(weighed, off, values, robust_sigma), iterations
+    return linearise(weighed, off, values, robust_sigma), iterations, weights.slack
 
 
 def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:

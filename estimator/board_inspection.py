@@ -12,11 +12,12 @@ from ..factors.camera import CameraModel
 from ..factors.chance import chi2_isf
 from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, MarkerSighting, Rejection
-from ..factors.rig import Rig
+from ..factors.rig import Board, Rig
 from ..frontends.board_check import Suspicion, suspicious_markers
 from ..frontends.board_fit import board_corners, fit_board
 from ..frontends.board_gross import without_gross_corners
 from ..frontends.board_pose import apparent_side, board_pose_candidates
+from ..frontends.fiducials.board_layout import DOUBLED, IN_PLACE, apart_on_page
 from .board_start import relabelled
 from .graph import State
 from .sheet import Sheet
@@ -33,7 +34,6 @@ VIEWS_TO_RELEASE = 3
 SAME_SHIFT_SIGMA, SAME_SHIFT_SHARE = 4.0, 0.3
 """Two views show a marker in one place when their shifts agree within that: noise, and views share errors of lens and
 print, which grow with the shift."""
-DOUBLED = "stands in the image more than once"
 SAME_PX = 1.0
 """Two sightings of an id that are nearer to each other than this are one."""
 MEMORY = 25
@@ -80,6 +80,8 @@ class Inspection:
         self._pinhole = pinhole
         self._votes: dict[tuple[str, str, int], _Votes] = {}
         self._fits: dict[tuple[str, str], list[float]] = {}
+        self._doubles: dict[tuple[str, int], list[tuple[int, float]]] = {}
+        """Stamp, and how far apart the two places of an id were, m."""
         self.events: dict[tuple[str, str, int], Event] = {}
         """By kind, board and marker."""
         self.rejected: list[Rejection] = []
@@ -115,11 +117,14 @@ class Inspection:
         for k, s in enumerate(seen):
             size = float(np.linalg.norm(s.corners_px[2] - s.corners_px[0]))
             place = expected.get(s.marker)
-            if counts[s.marker] == 1 or (place is not None and np.abs(s.corners_px - place).max() < 0.25 * size):
+            if counts[s.marker] == 1 or (place is not None and np.abs(s.corners_px - place).max() < IN_PLACE * size):
                 keep.append(k)
-        for marker in double:
-            self.doubled(sheet.board.id, marker, seen[0].stamp_ns)
         refuse = [k not in keep for k in range(len(seen))]
+        for s in [s for s, out in zip(seen, refuse, strict=True) if out]:
+            # from where it belongs; from the other one, where neither fits
+            others = [t.corners_px for t in seen if t.marker == s.marker and t is not s]
+            place = expected.get(s.marker, others[0])
+            self.doubled(sheet.board, s.marker, s.stamp_ns, apart_on_page(place, s.corners_px, self._side(sheet)))
         return self._without(seen, refuse, sheet, f"{DOUBLED}, places")
 
     def _expected(self, sheet: Sheet, rest: list[MarkerSighting], markers: list[int]) -> dict[int, Float]:
@@ -140,16 +145,36 @@ class Inspection:
 
     def doubled_in_images(self, refused: Sequence[Rejection]) -> None:
         """Ids that a front end has refused already, because they stood twice in an image."""
+        boards = {board.id: board for board in self._rig.boards}
         for r in refused:
             words = r.what.split()
             if r.reason.startswith(DOUBLED) and "marker" in words:
                 at = words.index("marker")
-                self.doubled(words[at - 1], int(words[at + 1]), r.stamp_ns)
+                self.doubled(boards[words[at - 1]], int(words[at + 1]), r.stamp_ns, r.value)
 
-    def doubled(self, board: str, marker: int, stamp_ns: int) -> None:
-        """Says, once, that an id is there twice."""
-        text = f"marker {marker} of board {board} is there twice; what does not fit the rest of the board is left out"
-        self._say("marker_duplicated", board, marker, stamp_ns, text, "warning")
+    def doubled(self, board: Board, marker: int, stamp_ns: int, apart_m: float) -> None:
+        """Says that an id is there twice, and how far apart: the median over all images so far.
+
+        The second one may lie anywhere in space, so its distance in the page's plane changes from view to view: sigma
+        is the spread of the views, and no less than what tells a marker in its place from one beside it.
+        """
+        seen = self._doubles.setdefault((board.id, marker), [])
+        if np.isfinite(apart_m):
+            seen.append((stamp_ns, apart_m))
+        if not seen:
+            return
+        distances = np.array([apart for _, apart in seen])
+        shift = float(np.median(distances))
+        sigma = max(1.4826 * float(np.median(np.abs(distances - shift))), np.sqrt(2.0) * board.centre_sigma_m)
+        if len(seen) < 3:
+            sigma = max(sigma, IN_PLACE * board.side_m)
+        text = (
+            f"marker {marker} of board {board.id} is there twice, {1e3 * shift:.0f} +/- {1e3 * sigma:.1f} mm apart as "
+            "seen on the page; what does not fit the rest of the board is left out"
+        )
+        values = {"marker": float(marker), "shift_m": shift, "sigma_m": float(sigma), "views": float(len(seen))}
+        first = min(stamp for stamp, _ in seen)
+        self.events["marker_duplicated", board.id, marker] = Event(first, "marker_duplicated", text, "warning", values)
 
     # Off their places -----------------------------------------------------------------------------------------
 
@@ -271,7 +296,7 @@ class Inspection:
             float(np.linalg.norm(np.subtract(m.centre_m, n.centre_m))) for m in board.markers for n in board.markers
         )
         if length > page_m + board.side_m:
-            self.doubled(board.id, marker, votes.stamps[0])
+            self.doubled(board, marker, votes.stamps[0], length)
             return
         since = "it came loose" if marker in sheet.slots else "from the start"
         what = f"marker {marker} is {1e3 * length:.1f} +/- {1e3 * sigma:.1f} mm off its place, {since}"

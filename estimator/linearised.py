@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags
 
 from ..factors.noise import robust_scale
 from .correlation import Active, correlate
@@ -50,10 +51,15 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
     return np.where(rejectable & (softened > scale), softened**2 / scale, softened)
 
 
-def with_correlated_tracks(at: Linearised, family: str) -> Linearised:
-    """The same with covariances that know that the errors of a family's tracks are correlated."""
+def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> Linearised:
+    """The same with covariances that know that the errors of a family's tracks are correlated.
+
+    Args:
+        slack: what else the standard deviations of their errors grow by.
+    """
     found = correlate(at.active, at.values, at.system, family)
     if found is None:
         return at
-    at.system.root = found.root
-    return Linearised(at.values, at.active, at.system, at.norms, found.inflation)
+    mine = np.repeat([record.family == family for _, _, record in at.active], at.system.rows)
+    at.system.root = csr_matrix(diags(np.where(mine, slack, 1.0)) @ found.root)
+    return Linearised(at.values, at.active, at.system, at.norms, found.inflation * slack**2)

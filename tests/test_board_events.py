@@ -144,6 +144,11 @@ def test_an_id_twice_in_one_image():
     doubled = replace(run, measurements=(*run.measurements, *away))
     result = estimate_run(doubled)
     assert_only(result, "marker_duplicated")
+    (event,) = told(result, "marker_duplicated")
+    # 60 px aside is another length on the page in every view
+    assert 0.02 < event.values["shift_m"] < 0.5
+    assert 0.0 < event.values["sigma_m"] < event.values["shift_m"]
+    assert event.stamp_ns == min(m.stamp_ns for m in others)
     assert len([r for r in result.rejected if "more than once" in r.reason]) >= len(others)
     assert_not_bent(run, result)
 

@@ -128,5 +128,35 @@ def test_edges_that_are_off_as_a_whole_are_in_the_covariance(rays, monkeypatch):
     nees = measure(a4_board(), lens, poses, taken)[2]
     assert 0.4 < nees.mean() < 2.0
     whole = pattern_fit.edge_errors
-    monkeypatch.setattr(pattern_fit, "edge_errors", lambda *a: replace(whole(*a), variance_px2=0.0))
+    monkeypatch.setattr(pattern_fit, "edge_errors", lambda *a: replace(whole(*a), variance_px2=np.zeros(len(a[0]))))
     assert measure(a4_board(), lens, poses, taken)[2].mean() > 2.0 * nees.mean()
+
+
+def test_a_shadow_across_one_marker_is_in_its_covariance_and_in_no_other():
+    """The edge of a shadow is no edge of the print. What it does to the fit stays the same in all views of a recording,
+    so it has to be told from one image."""
+    board, lens, rng = a4_board(), camera(230, 230, 270), np.random.default_rng(2)
+    shaded, others, sigmas = [], [], []
+    for k in range(12):
+        camera_T_f = pose(10.0, 40.0 * k, 3.0 * k, [0.002 * k, 0.003 * k, 0.85])
+        taken = Photography(blur_px=0.6, noise=0.0, black=30.0, white=210.0)
+        image = render_board(board, PAGE_M, lens, camera_T_f, taken, rng).astype(float)
+        truth = {k: project(lens, camera_T_f, c) for k, c in marker_corners(board).items()}
+        corners = truth[0]
+        middle, along = corners[:2].mean(0), corners[1] - corners[0]
+        v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+        across = ((u - middle[0]) * along[0] + (v - middle[1]) * along[1]) / np.linalg.norm(along)
+        near = np.exp(-((np.hypot(u - corners[:, 0].mean(), v - corners[:, 1].mean()) / np.linalg.norm(along)) ** 4))
+        image *= 1.0 - 0.5 * near / (1.0 + np.exp(across / 0.8))
+        image = np.clip(np.rint(image + rng.normal(0.0, 3.0, image.shape)), 0, 255).astype(np.uint8)
+        for s in MarkerFrontEnd(Rig(boards=(board,)), lens, "m_left").process(0, image)[0]:
+            error = s.corners_px - truth[s.marker]
+            square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(s.covariance_px2), error).mean() / 2
+            (shaded if s.marker == 0 else others).append(square)
+            sigmas.append((s.marker, np.sqrt(np.einsum("kii->k", s.covariance_px2).mean() / 2), np.abs(error).max()))
+    assert len(shaded) == 12
+    assert np.mean([worst for marker, _, worst in sigmas if marker == 0]) > 0.1
+    assert np.mean(shaded) < 2.0
+    assert 0.5 < np.mean(others) < 1.6
+    plain = np.mean([sigma for marker, sigma, _ in sigmas if marker != 0])
+    assert np.mean([sigma for marker, sigma, _ in sigmas if marker == 0]) > 3.0 * plain

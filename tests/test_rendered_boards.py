@@ -173,6 +173,9 @@ def test_one_id_twice():
     result, rejections, poses = run(Rig(boards=(page(),)), page(), doubled=2)
     event = told(result, "marker_duplicated")
     assert event.values["marker"] == 2.0
+    assert 0.05 < event.values["shift_m"] < 1.5
+    assert 0.0 < event.values["sigma_m"] < event.values["shift_m"]
+    assert event.stamp_ns == min(r.stamp_ns for r in rejections if "more than once" in r.reason)
     assert any("more than once" in r.reason for r in rejections)
     assert_not_bent(result, poses)
 

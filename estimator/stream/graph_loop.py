@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
+from ...factors.measurements import Pick
 from ...factors.rig import Rig, sha256_of
 from ..bounded import Bounded
 from ..decision import Decision, decide
@@ -22,6 +23,8 @@ from ..validated_range import ValidatedRange
 from .aside import Aside
 from .audit import Audit, audit
 from .calibration import departures, held, hold
+from .glances import Glance
+from .knocks import Knocks
 from .memory import Memory, recall, remember, save
 from .posterior import Posterior, posterior_of
 from .settings import S, StreamSettings
@@ -67,6 +70,7 @@ class GraphLoop:
         if memory is not None:
             recall(self.engine, memory)
             self._bounded.first = memory.keyframes
+        self._knocks = Knocks(self.engine)
         self._audit = Audit()
         self._auditing: Aside[Audit] = Aside(apart)
         self._saving: Aside[str] = Aside(apart)
@@ -118,6 +122,28 @@ class GraphLoop:
         self._answer_when_due(self.engine.end_ns, True, False)
         return taken
 
+    def glance(self, glance: Glance) -> None:
+        """Markers in a frame that is no keyframe."""
+        try:
+            changed = self._knocks.see(glance)
+        except ObservabilityError:
+            self.counts["undetermined"] += 1
+            return
+        self.counts["glances"] += 1
+        self._changed |= changed
+        if changed:
+            self.answer(glance.frame.stamp_ns)
+
+    def unplaced(self, sensed: Sensed) -> list[Pick]:
+        """Clicks in pictures that have passed, of which nothing is known any more."""
+        engine = self.engine
+        if engine.waiting:
+            return []  # a board may yet tell where these were made
+        passed = [p for p in sensed.bundle.picks if p.camera != "b_rgb" and p.stamp_ns < engine.end_ns]
+        found = [p for p in passed if engine.seen_from(p.camera, p.stamp_ns) is None]
+        self.counts["picks_too_late"] += len(found)
+        return found
+
     def freeze(self, on: bool) -> str:
         """Holds the calibration, or lets it go."""
         there = held(self.engine)
@@ -159,7 +185,9 @@ class GraphLoop:
             self._answer = replace(
                 self._answer, stamp_ns=stamp_ns, decisions=decisions, last_tie_ns=self.engine.boards.last_seen_ns()
             )
-        self._answer = replace(self._answer, counts=dict(self.counts), cpu_s=time.process_time())
+        self._answer = replace(
+            self._answer, counts=dict(self.counts), cpu_s=time.process_time(), suspects=self._knocks.suspects
+        )
         self._tell(self._answer)
         self._told_s = time.monotonic()
         return self._answer
@@ -179,8 +207,8 @@ class GraphLoop:
         """The audit's outcome, when it is there."""
         try:
             found = self._auditing.taken()
-        except ObservabilityError:
-            self.counts["undetermined"] += 1
+        except SurecutError:
+            self.counts["audits_failed"] += 1
             return
         if found is not None:
             self._audit, self._changed = found, True

@@ -19,6 +19,7 @@ from ..bundle import Bundle
 from ..items import Item, unreadable
 from ..sensing import Sensed, Sensing, images
 from ..sensors import PairImages
+from .glances import Glances
 from .parent import LOOK_NICE
 from .serving import serve
 from .settings import StreamSettings
@@ -68,6 +69,7 @@ class LookLoop:
         self._graph = graph
         self._thinning = Thinning(graph, settings, patient)
         self._out = out
+        self._glances = Glances(rig, settings)
         self._recent: OrderedDict[int, Recent] = OrderedDict()
         self._newest_ns = 0
         self._pair: StereoPair | None = None
@@ -108,12 +110,20 @@ class LookLoop:
         if bundle.frame is not None:
             frame = self._thinning.offered(bundle.frame, dear=bool(bundle.picks))
             if frame is not None:
-                sensed = replace(sensed, bundle=replace(bundle, frame=frame))
+                self._graph.put(replace(sensed, bundle=replace(bundle, frame=frame)))
+                self._glance(bundle.frame)
+                return
             elif sensed.depth is not None or sensed.cameras:
                 sensed = Sensed(Bundle(sensed.stamp_ns), sensed.depth, cameras=sensed.cameras)
             else:
                 return
         self._graph.put(sensed)
+
+    def _glance(self, frame: StereoFrame) -> None:
+        """Looks at the boards now and then while there are no keyframes."""
+        recent = self._recent.get(frame.stamp_ns)
+        if recent is not None and self._glances.due(frame):
+            self._graph.put(self._glances.look(frame, self._sensing.sensors.cameras["m_left"], recent.pair.left))
 
     def _note(self, items: list[Item]) -> None:
         for item in items:

@@ -69,14 +69,15 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     """
     if not engine.boards.any_known() or engine.graph.unsolved:
         return None
-    log, values = engine.solver.log, engine.state.values
-    graph = log.graph()
-    if solution is not None:
-        values, graph = solution.values, without_factors(log, set(solution.outliers))
+    if solution is None:
+        prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
+    else:
+        graph = without_factors(engine.solver.log, set(solution.outliers))
+        prior = gaussian_of(graph, solution.values, long_lived(solution.values))
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
-        prior=gaussian_of(graph, values, long_lived(values)),
+        prior=prior,
         cameras=dict(engine.cameras),
         boards=[
             {

@@ -8,6 +8,10 @@ from ...factors.rig import Board, Marker
 
 Float = NDArray[np.float64]
 
+DOUBLED = "stands in the image more than once"
+"""Why a sighting is refused of whose id there is another one in the same image."""
+IN_PLACE = 0.25
+"""Share of its diagonal, or side, by which a sighting may be off the place of its marker and still be this one."""
 _SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
 
@@ -15,6 +19,22 @@ def marker_on_page(marker: Marker, side_m: float) -> Float:
     """Corners of a marker in the page frame, shape (4, 2), order 0..3 = (-,-), (+,-), (+,+), (-,+)."""
     c, s = np.cos(marker.rotation_rad), np.sin(marker.rotation_rad)
     return side_m * _SQUARE @ np.array([[c, s], [-s, c]]) + np.array(marker.centre_m)
+
+
+def apart_on_page(place: Float, other: Float, side_m: float) -> float:
+    """How far two quadrilaterals of an image, (4, 2) each, lie apart in the plane of the first, m.
+
+    The first is a marker with a side of `side_m`; what is not in its plane is taken where its ray meets it. NaN where
+    it does not.
+    """
+    H, _ = cv2.findHomography(place, side_m * _SQUARE, 0)
+    if H is None:
+        return float("nan")
+    q = np.append(other.mean(0), 1.0) @ H.T
+    middle = np.append(place.mean(0), 1.0) @ H.T
+    if q[2] * middle[2] <= 0:
+        return float("nan")
+    return float(np.linalg.norm(q[:2] / q[2] - middle[:2] / middle[2]))
 
 
 def predict_missing(

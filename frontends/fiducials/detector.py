@@ -10,7 +10,7 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, MarkerSighting, Rejection
 from ...factors.rig import Board, Rig
 from ..undistort import distort, undistort, undistorted_grid
-from .board_layout import predict_missing
+from .board_layout import DOUBLED, IN_PLACE, apart_on_page, predict_missing
 from .dictionaries import MarkerDictionary, marker_dictionary
 from .independent_corners import independent_scale
 from .pattern_fit import PatternFit, Warm, fit_patterns
@@ -120,7 +120,7 @@ class MarkerFrontEnd:
         result: list[_Fitted] = []
         for cells in sorted({self._dictionaries[m.dictionary].cells for m in before}):
             index = [k for k, m in enumerate(before) if self._dictionaries[m.dictionary].cells == cells]
-            ideal = undistort(self._camera, raw[index])[0]
+            ideal = self._ideal(raw[index])
             if not np.isfinite(ideal).all():
                 return None
             group = [before[k] for k in index]
@@ -153,10 +153,17 @@ class MarkerFrontEnd:
         return good, [*rejections, *(self._rejection(stamp_ns, f) for f in refused)]
 
     def _confirmed(self, followed: list[_Fitted], read: list[Candidate]) -> bool:
-        """Has each marker that was followed been read once where it was followed to, and none beside them?"""
+        """Do the markers that were followed stand by what was read: each once, where it was followed to, none beside
+        them, and those that were not read on a board that was, and as plain as one that is only expected must be?"""
         places = {f.candidate.key: f.corners for f in followed}
-        if not followed or len(read) != len(places) or {c.key for c in read} != set(places):
+        keys = {c.key for c in read}
+        if not keys or len(keys) < len(read) or not keys <= set(places):
             return False
+        boards = {self._boards[key].id for key in keys}
+        for f in followed:
+            known = self._boards[f.candidate.key].id in boards and f.correlation >= _MIN_CORRELATION_PREDICTED
+            if f.candidate.key not in keys and not known:
+                return False
         off = [np.abs(self._ours(c, False) - places[c.key]).max() for c in read]
         sides = [np.sqrt(cv2.contourArea(places[c.key].astype(np.float32))) for c in read]
         return bool(np.all(np.array(off) < _SAME_PLACE * np.array(sides)))
@@ -199,7 +206,22 @@ class MarkerFrontEnd:
         if ideal:
             return candidate.corners
         order = self._dictionaries[candidate.dictionary].from_opencv
-        return undistort(self._camera, candidate.corners[list(order)])[0]
+        return self._ideal(candidate.corners[list(order)])
+
+    def _ideal(self, raw: Float) -> Float:
+        """Where a fit begins, shape (..., 2): between the pixels as the lens bends the pixels round it."""
+        if self._positions is None:
+            return undistort(self._camera, raw)[0]
+        height, width = self._positions.shape[:2]
+        x, y = raw[..., 0], raw[..., 1]
+        if not ((x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)).all():
+            return undistort(self._camera, raw)[0]
+        left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+        s, t = (x - left)[..., None], (y - top)[..., None]
+        grid = self._positions
+        upper = (1 - s) * grid[top, left] + s * grid[top, left + 1]
+        lower = (1 - s) * grid[top + 1, left] + s * grid[top + 1, left + 1]
+        return (1 - t) * upper + t * lower
 
     def _one_per_marker(self, fitted: list[_Fitted]) -> tuple[list[_Fitted], list[_Fitted]]:
         """One place per marker. Where a marker stands twice in the image, the rest of its board decides, or none."""
@@ -218,14 +240,15 @@ class MarkerFrontEnd:
                 continue
             expected = predict_missing(self._boards, single).get(key)
             size = np.linalg.norm(distinct[0].corners[2] - distinct[0].corners[0])
+            off = [np.inf if expected is None else float(np.abs(f.corners - expected).max()) for f in distinct]
+            fits = [f for f, o in zip(distinct, off, strict=True) if o < IN_PLACE * size]
+            good += fits
+            side = self._boards[key].side_m
             for f in distinct:
-                off = np.inf if expected is None else float(np.abs(f.corners - expected).max())
-                if off < 0.25 * size:
-                    good.append(f)
-                else:
-                    refused.append(
-                        _refused(f, "stands in the image more than once, number of places", len(distinct), 1)
-                    )
+                if not any(f is g for g in fits):
+                    from_others = [g for g in fits or distinct if g is not f]
+                    apart = min(apart_on_page(g.corners, f.corners, side) for g in from_others)
+                    refused.append(_refused(f, f"{DOUBLED}, m from the other place", apart, IN_PLACE * side))
         return good, refused
 
     def _sightings(self, stamp_ns: int, good: list[_Fitted]) -> list[MarkerSighting]:

@@ -29,14 +29,16 @@ _LEAST_SHARE = 1e-3
 _RANK = 1e-3
 """Directions that the fit takes up to this share tell nothing."""
 _ROUNDING2 = 1.0 / 12.0
+_STANDS_OUT = 4.0
+"""Sigmas by which one marker's edges err more than those of the others say."""
 
 
 @dataclass(frozen=True, slots=True)
 class EdgeErrors:
     """Of the m markers of one image."""
 
-    variance_px2: float
-    """Of one grid line's place: the same for all."""
+    variance_px2: Float
+    """Of one grid line's place, shape (m,): the same for all, but for markers that stand out."""
     noise_variance: Float
     """Of a pixel, in grey values, without what the lines explain; shape (m,)."""
     spread: Float
@@ -53,7 +55,7 @@ def edge_errors(
         inverse: of its normal matrix, shape (m, k, k).
         residual: shape (m, n), of the fit.
         weight: shape (m, n).
-        shifts: change of the grey values by a shift of each grid line, pixels, of constant a and of b, shape (m, 2, l, n).
+        shifts: change of the grey values by a shift of each grid line of constant a, then of b, shape (m, 2, l, n).
         place: (a - 1/2, b - 1/2) of each pixel in the marker, shape (m, 2, n).
     """
     m, _, lines, n = shifts.shape
@@ -75,9 +77,36 @@ def edge_errors(
     by_noise = np.einsum("mll,ml->m", S, over)
     by_lines = np.einsum("mlk,mlk,ml->m", S, S, over)
     off = ((u**2 * over).sum(1) - noise * by_noise) / noise
-    variance = max(float(off.sum() / max((by_lines / noise).sum(), 1e-12)), 0.0)
+    variance = _variance(off, by_lines / noise, S, np.sqrt(over), noise)
     K = through[:, :8] * seen[:, None, :]
     return EdgeErrors(variance, noise, K @ K.transpose(0, 2, 1))
+
+
+def _variance(off: Float, by_lines: Float, S: Float, root: Float, noise: Float) -> Float:
+    """The variance that all markers share, and the own one of a marker that the others do not explain.
+
+    Lens, exposure and print are common to the markers of an image. The edge of a shadow, a fold or a stain is one
+    marker's: it would spoil the others and be played down there.
+
+    Args:
+        off: excess of each marker's quadratic form, over its noise, shape (m,).
+        by_lines: expectation of that for a variance of one, shape (m,).
+        S: shape (m, l, l).
+        root: D^-1/2, shape (m, l).
+        noise: shape (m,).
+    """
+    shared = np.full(len(off), max(float(off.sum() / max(by_lines.sum(), 1e-12)), 0.0))
+    if len(off) < 2:
+        return shared
+    others = np.maximum((off.sum() - off) / np.maximum(by_lines.sum() - by_lines, 1e-12), 0.0)
+    half = root[:, :, None] * S
+    form = others[:, None, None] * (half @ half.transpose(0, 2, 1)) + noise[:, None, None] * half * root[:, None]
+    scatter = np.sqrt(2.0 * np.einsum("mlk,mkl->m", form, form)) / noise
+    alone = off - by_lines * others > _STANDS_OUT * scatter
+    if not alone.any() or alone.all():
+        return shared
+    rest = max(float(off[~alone].sum() / max(by_lines[~alone].sum(), 1e-12)), 0.0)
+    return np.where(alone, off / np.maximum(by_lines, 1e-12), rest)
 
 
 def _noise(S: Float, u: Float, over: Float, residual: Single, weight: Single, unknowns: int) -> Float:

@@ -9,6 +9,7 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import CameraName, MarkerSighting, Rejection
 from ...factors.rig import Board, Rig
 from ..undistort import undistort
+from .board_layout import DOUBLED, IN_PLACE, apart_on_page
 from .dictionaries import canonical_name
 
 Float = NDArray[np.float64]
@@ -59,8 +60,11 @@ def sightings_from_messages(
             reason = "corners beyond the lens model, number"
             rejections.append(Rejection(stamp_ns, "markers", what, reason, float(lost), 0.0))
         elif keys.count(key) > 1:
-            reason = "stands in the image more than once, number of places"
-            rejections.append(Rejection(stamp_ns, "markers", what, reason, float(keys.count(key)), 1.0))
+            places = [ideal[j][_TO_OURS[board.message_corner_order]] for j, same in enumerate(keys) if same == key]
+            mine = ideal[k][_TO_OURS[board.message_corner_order]]
+            apart = max(apart_on_page(mine, other, board.side_m) for other in places)
+            reason = f"{DOUBLED}, m from the other place"
+            rejections.append(Rejection(stamp_ns, "markers", what, reason, apart, IN_PLACE * board.side_m))
         else:
             order = _TO_OURS[board.message_corner_order]
             found = ideal[k][order], covariance[k][order], corners[k][order]

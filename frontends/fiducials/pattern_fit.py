@@ -363,7 +363,7 @@ def _summary(state: _State, solved: _Settled, pixels: Pixels, noise: Float) -> P
     edges = edge_errors(solved.columns, solved.inverse, solved.residual, weight, solved.shifts, solved.place)
     last_step = np.abs(solved.step[:, :8]).max(1)
     by_noise = solved.inverse[:, :8, :8] * edges.noise_variance[:, None, None]
-    covariance = by_noise + edges.variance_px2 * edges.spread
+    covariance = by_noise + edges.variance_px2[:, None, None] * edges.spread
     covariance += ((_UNSETTLED * last_step) ** 2)[:, None, None] * np.eye(8)
     return PatternFit(
         state.corners + pixels.origin[:, None],
