@@ -178,7 +178,7 @@ class Pipes:
         return True
 
     def begin(self, pipe_id: str, middle: Float, direction: Float, radius_m: float, stamp_ns: int) -> Update:
-        """A pipe that something else than edges has shown: its axis about a point of {o}. Its picks lie on it from now."""
+        """A pipe that something else than edges has shown: its axis about a point of {o}; its picks lie on it now."""
         update, cylinder = Update(), self._cylinder(pipe_id)
         self._enter_pipe(cylinder, middle, direction / np.linalg.norm(direction), radius_m, stamp_ns, update)
         for point in self.points.values():
