@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from . import keys
 from .geometry import point_to_frame
-from .noise import Model, gaussian, robust
+from .noise import Model, robust
 
 Float = NDArray[np.float64]
 
