@@ -72,6 +72,7 @@ class Pipeline:
         self._outlines.complete()
         if self._base.search(self._depths.view, last=True):
             self.engine.revisit()
+        self._depths.begin_unknown()
         self._depths.search()
 
     def check(self, report: SensingReport) -> None:
