@@ -50,7 +50,7 @@ def click(scene: Surroundings, point: int, pose_key: int, o_T_c: gtsam.Pose3, ca
         o_T_c: the camera itself.
     """
     floor = scene.engine.rig.noise.pick_floor_px
-    sigma = scene.sigma(PICKS, camera, scene.sigma(PICKS, "m_left", float(np.hypot(1.0, floor))))
+    sigma = scene.sigma(PICKS, camera, scene.sigma(PICKS, "m_left", max(1.0, floor)))
     K = scene.values.atCal3DS2(keys.intrinsics(camera)).K()
     px = K @ o_T_c.transformTo(scene.values.atPoint3(point))
     noise = sigmas([sigma] * 2)

@@ -23,10 +23,12 @@ Float = NDArray[np.float64]
 OUTLIER_SIGMA = 4.5
 """Residuals beyond it (probability of one dimension) are outliers: one in 150 000 by chance."""
 
-SNOOPED = ("depth cloud", "pipe outline", "picks")
+SNOOPED = ("depth cloud", "pipe outline", "pipe width", "picks")
 """Families of few measurements, each of which may hold a degree of freedom almost alone."""
 SNOOPING_SIGMA = 3.7
 SNOOPING_ROUNDS = 8
+CONVERGED, ON_THE_WAY = 1e-6, 1e-4
+"""Share of the error that an iteration may still gain: at the end, and while outliers are being taken out."""
 MINIMUM_VIEWS = 2
 """Pixels that a landmark needs to be a point."""
 
@@ -63,32 +65,38 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            values, more = optimum(without_factors(log, off), at.values)
+            values, more = optimum(without_factors(log, off), at.values, ON_THE_WAY)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
-    at, more = _with_track_weights(log, off, at, robust_sigma)
-    at = with_correlated_tracks(at, ODOMETRY)
+    at, more, slack = _with_track_weights(log, off, at, robust_sigma)
+    at = with_correlated_tracks(at, ODOMETRY, slack)
     iterations += more
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
-def _with_track_weights(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[Linearised, int]:
-    """The optimum with tracks weighed by what they are worth, and the iterations to there."""
+def _with_track_weights(
+    log: FactorLog, off: set[int], at: Linearised, robust_sigma: float
+) -> tuple[Linearised, int, float]:
+    """The optimum with tracks weighed by what they are worth, the iterations to there, and the weights' slack."""
+    weights = track_weights(at.active, at.system, ODOMETRY)
+    if not weights.by_position:
+        values, iterations = optimum(without_factors(log, off), at.values) if off else (at.values, 0)
+        return (linearise(log, off, values, robust_sigma) if iterations else at), iterations, 1.0
     factors = {}
-    for position, weight in track_weights(at.active, at.system, ODOMETRY).items():
+    for position, weight in weights.by_position.items():
         index, factor, record = at.active[position]
         factors[index] = reweighed(factor, record.camera or "", weight, robust_sigma)
-    if not factors:
-        return at, 0
     weighed = log.replaced(factors)
     values, iterations = optimum(without_factors(weighed, off), at.values)
-    return linearise(weighed, off, values, robust_sigma), iterations
+    return linearise(weighed, off, values, robust_sigma), iterations, weights.slack
 
 
-def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+def optimum(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float = CONVERGED
+) -> tuple[gtsam.Values, int]:
     """Levenberg-Marquardt from a start near the optimum: the values, and the number of iterations."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-6)
+    parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(1e-4)
     parameters.setMaxIterations(40)
     parameters.setlambdaInitial(1e-5)

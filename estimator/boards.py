@@ -239,6 +239,30 @@ class Boards:
 
     # A new place ----------------------------------------------------------------------------------------------
 
+    def seen_off(
+        self,
+        keyframe: int,
+        camera_poses: Mapping[str, gtsam.Pose3],
+        sightings: Sequence[MarkerSighting],
+        joint: Joint,
+    ) -> dict[str, float]:
+        """Known boards that a view contradicts, by how far (m) they seem to have moved; nothing is changed.
+
+        Args:
+            keyframe: key of the pose with whose uncertainty the cameras stand.
+        """
+        found: dict[str, float] = {}
+        for sheet, seen in self._by_sheet(sightings):
+            good = self.inspection.in_place(sheet, seen) if sheet.known else []
+            if not good or not self._off(sheet, camera_poses, good):
+                continue
+            state, rig, pinhole = self._state, self._rig, self._first.pinhole
+            view = displacement(sheet, keyframe, camera_poses, good, state, rig, pinhole, joint)
+            if view is not None and view.o_T_f is not None:
+                shift = view.o_T_f.translation() - state.pose(sheet.key).translation()
+                found[sheet.board.id] = float(np.linalg.norm(shift))
+        return found
+
     def _elsewhere(
         self,
         sheet: Sheet,

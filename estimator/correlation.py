@@ -140,8 +140,8 @@ def _summed(whole: Float, group: Int) -> Float:
 
 def _parts(tracks: "Tracks", values: gtsam.Values) -> list[Int]:
     """Tracks (n,) by the part of the scene that they are in: cells of space, for two grids."""
-    points = np.array([values.atPoint3(landmark) for landmark in tracks.landmarks])
-    seen_from = np.array([values.atPose3(keyframe).translation() for keyframe in tracks.first_keyframes])
+    points = np.array([values.atPoint3(_key(first, "l")) for first in tracks.firsts])
+    seen_from = np.array([values.atPose3(_key(first, "x")).translation() for first in tracks.firsts])
     size = PART * float(np.median(np.linalg.norm(points - seen_from, axis=1)))
     cells = [np.floor((points - points.min(axis=0)) / size + shift).astype(np.int64) for shift in (0.0, 0.5)]
     return [np.unique(cell, axis=0, return_inverse=True)[1].ravel() for cell in cells]
@@ -253,10 +253,8 @@ class Tracks:
         order = np.argsort(stamps, kind="stable")
         self.images = np.split(order, np.flatnonzero(np.diff(stamps[order])) + 1) if len(order) else []
         """Entries of one keyframe each, in the order of time."""
-        firsts = [active[self._factor[i].max()][1] for i in np.flatnonzero(self.place == 0)]
-        self.landmarks = [_key(factor, "l") for factor in firsts]
-        """By track."""
-        self.first_keyframes = [_key(factor, "x") for factor in firsts]
+        self.firsts = [active[self._factor[i].max()][1] for i in np.flatnonzero(self.place == 0)]
+        """By track, a factor of its first keyframe."""
         self.stamps: list[int] = [int(stamps[i[0]]) for i in self.images]
         self.keyframes = [_key(active[self._factor[i[0]].max()][1], "x") for i in self.images]
         px = self._pixels(active)

@@ -32,7 +32,8 @@ from .machine import Machine
 from .observability import why_no_base
 from .odometry import Odometry, OdometrySettings
 from .open_graph import OpenGraph
-from .pipes import Pipes, SeenFrom
+from .pipe_parts import SeenFrom
+from .pipes import Pipes
 from .placement import place
 from .surfaces import Associator, Surfaces, SurfaceSettings
 

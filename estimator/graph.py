@@ -14,7 +14,7 @@ class Record:
 
     family: str
     """`marker corners`, `board geometry`, `known distances`, `stereo odometry`, `depth cloud`, `pipe outline`,
-    `picks`, `mount`, `colour view`, `calibration priors`, `gauge`."""
+    `pipe width`, `picks`, `mount`, `colour view`, `calibration priors`, `gauge`."""
     source: str
     """Finer than the family: the camera, the board, or the calibration state whose prior it is."""
     stamp_ns: int

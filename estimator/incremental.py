@@ -1,6 +1,6 @@
 """The running solver: iSAM2 over the factors as they come."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -82,6 +82,8 @@ class Incremental:
         """iSAM2's index of each factor of the log."""
         self._values = gtsam.Values()
         self._relocated = False
+        self._unheld: set[int] = set()
+        """Landmarks that nothing determined when covariances were last asked for, until the solver begins anew."""
         self.log = FactorLog()
         self.dropped: list[int] = []
         """Landmarks that were given up: wrong matches had driven them to where nothing determines them."""
@@ -245,6 +247,7 @@ class Incremental:
 
     def _begin(self, values: gtsam.Values) -> None:
         """iSAM2 anew on all factors, linearised at `values`."""
+        self._unheld.clear()
         self._isam = gtsam.ISAM2(_parameters())
         self._values = values
         try:
@@ -286,7 +289,7 @@ class Incremental:
         Raises:
             ObservabilityError: one of them is not determined, or another variable that is no landmark's.
         """
-        joint = self._joint_of(wanted)
+        joint = self.joint_gaussian(wanted)
         try:
             covariance = np.linalg.inv(joint.H)
         except np.linalg.LinAlgError as error:
@@ -297,23 +300,25 @@ class Incremental:
         chosen = np.concatenate([columns[key] for key in wanted])
         return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
 
-    def _joint_of(self, wanted: Sequence[int]) -> GaussianPrior:
-        """Landmarks that nothing determines at this linearisation say nothing: they are passed over."""
-        graph = self.log.graph()
+    def joint_gaussian(self, wanted: Collection[int]) -> GaussianPrior:
+        """Joint Gaussian of some variables, all others eliminated; those that no factor touches are left out.
+
+        Landmarks that nothing determines at this linearisation, such as those behind the cameras that saw them, say
+        nothing: they are passed over.
+
+        Raises:
+            ObservabilityError: another variable is not determined.
+        """
         for _ in range(MOST_DROPPED):
             try:
                 with determined():
-                    return gaussian_of(graph, self._values, wanted)
+                    return gaussian_of(self._without(self._unheld.difference(wanted)), self._values, wanted)
             except Undetermined as error:
                 if keys.kind(error.key) != "l" or error.key in wanted:
                     raise
-                lost, rest = error.key, gtsam.NonlinearFactorGraph()
-                for factor in (graph.at(i) for i in range(graph.size())):
-                    if lost not in factor.keys():
-                        rest.add(factor)
-                graph = rest
+                self._unheld.add(error.key)
         with determined():
-            return gaussian_of(graph, self._values, wanted)
+            return gaussian_of(self._without(self._unheld.difference(wanted)), self._values, wanted)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:

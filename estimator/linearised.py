@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags
 
 from ..factors.noise import robust_scale
 from .correlation import Active, correlate
@@ -26,6 +27,13 @@ class Linearised:
     """(factors,), norm of each whitened residual, the robust loss undone."""
     inflation: float = 1.0
     """Variance of the tracks' errors over what they state, on average."""
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors, with the weights that they have here."""
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor, _ in self.active:
+            graph.add(factor)
+        return graph
 
 
 def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
@@ -50,10 +58,15 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
     return np.where(rejectable & (softened > scale), softened**2 / scale, softened)
 
 
-def with_correlated_tracks(at: Linearised, family: str) -> Linearised:
-    """The same with covariances that know that the errors of a family's tracks are correlated."""
+def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> Linearised:
+    """The same with covariances that know that the errors of a family's tracks are correlated.
+
+    Args:
+        slack: what else the standard deviations of their errors grow by.
+    """
     found = correlate(at.active, at.values, at.system, family)
     if found is None:
         return at
-    at.system.root = found.root
-    return Linearised(at.values, at.active, at.system, at.norms, found.inflation)
+    mine = np.repeat([record.family == family for _, _, record in at.active], at.system.rows)
+    at.system.root = csr_matrix(diags(np.where(mine, slack, 1.0)) @ found.root)
+    return Linearised(at.values, at.active, at.system, at.norms, found.inflation * slack**2)

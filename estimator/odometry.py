@@ -48,16 +48,22 @@ class FramePose:
     """Index of the keyframe."""
     keyframe_T_this: Float
     """Shape (4, 4)."""
+    tracks: "SeenTracks | None" = None
+    """Of a frame between keyframes; None where nothing was tracked."""
 
 
 @dataclass(frozen=True, slots=True)
-class Arrival:
-    """How the front end came from one keyframe to the next: what the frames in between were placed by."""
+class SeenTracks:
+    """Where a frame's left image shows the tracks. Kept for every frame, so it is small."""
 
-    before: int
-    """Index of the keyframe that its motion counts from."""
-    before_T_this: Float
-    """Shape (4, 4)."""
+    ids: NDArray[np.int64]
+    """Shape (n,)."""
+    left_px: NDArray[np.float32]
+    """Shape (n, 2), ideal pixels."""
+
+    @classmethod
+    def of(cls, frame: StereoFrame) -> "SeenTracks | None":
+        return None if frame.lost else cls(frame.track_ids, frame.left_px.astype(np.float32))
 
 
 View = tuple[int, StereoFrame, int]
@@ -76,8 +82,6 @@ class Odometry:
         """Views of waiting tracks before the one that waits, the newest first: they did not agree with the next one."""
         self.keyframe_stamps: list[int] = []
         self.frames: list[FramePose] = []
-        self.arrivals: dict[int, Arrival] = {}
-        """By the index of the keyframe that was come to."""
         self.seen_in: dict[int, int] = {}
         """The last keyframe that saw a landmark."""
         self.observations: dict[int, int] = {}
@@ -113,7 +117,8 @@ class Odometry:
         if self._reference >= 0:
             self._keyframe_T_last = self._keyframe_T_last @ frame.last_T_this
             self._since_keyframe_lost |= frame.lost
-            self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last))
+            tracks = SeenTracks.of(frame)
+            self.frames.append(FramePose(frame.stamp_ns, self._reference, self._keyframe_T_last, tracks))
 
     def insert(self, frame: StereoFrame, placed: gtsam.Pose3 | None = None) -> tuple[Update, list[Rejection]]:
         """Makes the frame just followed a keyframe.
@@ -143,12 +148,11 @@ class Odometry:
         if len(known) < self._settings.minimum_shared:
             self._create_from_before(update, frame, index, pose)
         self.keyframe_stamps.append(frame.stamp_ns)
-        if self._reference >= 0 and placed is None:
-            self.arrivals[index] = Arrival(self._reference, self._keyframe_T_last)
         self._reference = index
         self._keyframe_T_last = np.eye(4)
         self._since_keyframe_lost = False
-        self.frames = [f for f in self.frames if f.stamp_ns != frame.stamp_ns]
+        if self.frames and self.frames[-1].stamp_ns == frame.stamp_ns:
+            self.frames.pop()
         self.frames.append(FramePose(frame.stamp_ns, index, np.eye(4)))
         return update, rejected
 
@@ -159,7 +163,6 @@ class Odometry:
         self.observations = {t: n for t, n in self.observations.items() if t not in landmarks}
         self.seen_in = {t: k for t, k in self.seen_in.items() if t not in landmarks}
         self.frames = [f for f in self.frames if f.keyframe not in keyframes]
-        self.arrivals = {k: a for k, a in self.arrivals.items() if k not in keyframes and a.before not in keyframes}
 
     def place(self, stamp_ns: int, index: int) -> None:
         """A keyframe that markers alone have placed."""

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from ..factors.measurements import OutlineSighting, Pick, Rejection
 from ..frontends.pipe.pairs import OutlinePrior
-from ..frontends.pipe.predict import predict_outline
+from ..frontends.pipe.predict import part_in_sight, predict_outline
 from ..frontends.pipe.silhouette import OutlineFinder
 from .engine import Engine
-from .pipes import AXIS_ROLES
+from .pipe_widths import KeptView, PipeWidths
+from .pipes import AXIS_ROLES, INSET_SHARE
 from .sensors import PairImages
 
 Float = NDArray[np.float64]
@@ -24,12 +25,8 @@ OUTLINE_VIEWS = 16
 """Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
-OUTLINE_PRIOR = (0.006, 0.02, 0.004)
-"""Sigmas of axis [m], direction [rad] and radius [m] with which a known pipe's outline is looked for. The radius's is
-measured, not derived: with half, three quarters and one pixel at the pipe's range edges within the pipe took its
-outline's place in one of twenty rendered recordings, see docs/kinect.md."""
-PART_M = 0.1
-"""A pipe is taken to go on so far beyond its picks."""
+AXIS_SIGMA_M, DIRECTION_SIGMA_RAD = 0.006, 0.02
+"""Sigmas with which the axis of a known pipe is looked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +54,18 @@ class OutlineSearch:
         """Views that have been chosen and not looked at."""
         self._found: list[OutlineSighting | Rejection] = []
         """In those before them. They enter together, as if there had been no wait."""
+        self._clicked = False
+        """Is there a click that widths have not been measured with?"""
         self._finders: dict[str, OutlineFinder] = {}
+        self._widths = PipeWidths(engine)
         self._kept: deque[PairImages] = deque()
         self._kept_bytes = 0
         self._looked: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
         self._passed: dict[str, set[int]] = {}
         """Stamps of views too near to one of these."""
+        self._apart: dict[str, dict[int, Float]] = {}
+        """Where the camera stood in views that differ, of all that show the pipe, by pipe and camera, and stamp."""
 
     def see(self, pair: PairImages, picks: Sequence[Pick]) -> None:
         """A keyframe's pictures, and the clicks in them."""
@@ -73,15 +75,13 @@ class OutlineSearch:
             self._kept_bytes -= self._kept.popleft().nbytes
         clicked = [pick for pick in picks if pick.role in AXIS_ROLES and pick.camera in MOBILE]
         for pick in clicked:
-            self._about(pick, pair)
+            if self._widths.of(self._engine.pipes.pipe_of(pick.point_id)) is None:
+                self._about(pick, pair)
         if clicked:
             self._engine.flush()
+            self._clicked = True
         if not self._ahead:
-            for pipe in list(self._engine.pipes.cylinders):
-                axis = self._engine.pipes.axis(pipe)
-                if axis is not None:
-                    for camera in MOBILE:
-                        self._choose(pipe, axis, camera)
+            self._look()
         self.go_on()
 
     def go_on(self, to_the_end: bool = False) -> None:
@@ -98,6 +98,56 @@ class OutlineSearch:
                 self._take(found)
             self._found.clear()
             self._engine.flush()
+            self._enter_widths()
+
+    def complete(self) -> None:
+        """No more pictures will come: the widths with all that is known of the axes, and the edges by them."""
+        self.go_on(to_the_end=True)
+        self._clicked = True
+        self._look()
+        self.go_on(to_the_end=True)
+
+    def _look(self) -> None:
+        """Measures widths, and chooses the views to look at."""
+        pipes, anew = self._engine.pipes, self._clicked
+        self._clicked = False
+        for pipe in pipes.named():
+            ends = pipes.known_part(pipe)
+            if ends is not None:
+                self._measure_width(pipe, ends, anew)
+                for camera in MOBILE:
+                    self._choose(pipe, camera)
+        self._enter_widths()
+
+    def _enter_widths(self) -> None:
+        for pipe in self._engine.pipes.named():
+            self._widths.enter(pipe)
+
+    def _measure_width(self, pipe: str, ends: tuple[Float, Float], anew: bool) -> None:
+        views = [KeptView(pair, camera) for camera in MOBILE for pair in self._differing(pipe, camera, ends)]
+        if self._widths.measure(pipe, ends, views, anew):
+            # What was found without knowing the width is looked for again.
+            stamps = {pair.stamp_ns for pair in self._kept}
+            self._widths.forget_outlines(pipe, stamps)
+            for camera in MOBILE:
+                looked = self._looked.get(f"{pipe} {camera}", {})
+                self._looked[f"{pipe} {camera}"] = {s: place for s, place in looked.items() if s not in stamps}
+                self._passed.pop(f"{pipe} {camera}", None)
+
+    def _differing(self, pipe: str, camera: str, ends: tuple[Float, Float]) -> list[PairImages]:
+        """Kept pictures that show a part of a pipe, each from somewhere else."""
+        apart = self._apart.setdefault(f"{pipe} {camera}", {})
+        model = self._engine.cameras[camera]
+        for pair in self._kept:
+            if len(apart) >= OUTLINE_VIEWS:
+                break
+            where = self._engine.seen_from(camera, pair.stamp_ns)
+            if where is None or pair.stamp_ns in apart:
+                continue
+            place = where.o_T_c.translation()
+            if not _near(place, apart) and part_in_sight(model, *(where.o_T_c.transformTo(end) for end in ends)):
+                apart[pair.stamp_ns] = place
+        return [pair for pair in self._kept if pair.stamp_ns in apart]
 
     def _about(self, pick: Pick, pair: PairImages) -> None:
         """The outline about a click."""
@@ -110,11 +160,15 @@ class OutlineSearch:
             looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
             looked[pair.stamp_ns] = where.o_T_c.translation()
 
-    def _choose(self, pipe: str, axis: tuple[Float, Float, float], camera: str) -> None:
+    def _choose(self, pipe: str, camera: str) -> None:
         """Views for a known pipe's outline that differ from those already used."""
+        expected = self._expected(pipe)
+        if expected is None:
+            return
+        ends, radius, radius_sigma = expected
         looked = self._looked.setdefault(f"{pipe} {camera}", {})
         passed = self._passed.setdefault(f"{pipe} {camera}", set())
-        ends = _part_of_axis(self._engine.pipes.places(pipe), axis)
+        model = self._engine.cameras[camera]
         for pair in [kept for kept in self._kept if kept.stamp_ns not in looked and kept.stamp_ns not in passed]:
             if len(looked) >= OUTLINE_VIEWS:
                 break
@@ -122,14 +176,28 @@ class OutlineSearch:
             if where is None:
                 continue
             place = where.o_T_c.translation()
-            if looked and (np.linalg.norm(place - np.array([*looked.values()]), axis=1) < OUTLINE_SPACING_M).any():
+            if _near(place, looked):
                 passed.add(pair.stamp_ns)
                 continue
             a, b = (where.o_T_c.transformTo(end) for end in ends)
-            prior = predict_outline(self._engine.cameras[camera], a, b, axis[2], *OUTLINE_PRIOR)
+            sigma = radius_sigma or unmeasured_sigma(radius, 0.5 * float(a[2] + b[2]), model.fx)
+            prior = predict_outline(model, a, b, radius, AXIS_SIGMA_M, DIRECTION_SIGMA_RAD, sigma)
             if prior is not None:
                 looked[pair.stamp_ns] = place
                 self._ahead.append(_View(pipe, camera, pair, prior))
+
+    def _expected(self, pipe: str) -> tuple[tuple[Float, Float], float, float] | None:
+        """Part of the axis, radius and the radius's sigma (0: not measured), with which outlines are looked for."""
+        width, axis = self._widths.of(pipe), self._engine.pipes.axis(pipe)
+        ends = self._engine.pipes.known_part(pipe)
+        if ends is None or (axis is None and width is None):
+            return None
+        if axis is not None and width is None:
+            return ends, axis[2], 0.0
+        assert width is not None
+        if axis is None:
+            ends = ends[0] + width.offset_m, ends[1] + width.offset_m
+        return ends, width.radius_m, width.sigma_m
 
     def _take(self, found: OutlineSighting | Rejection) -> None:
         if isinstance(found, OutlineSighting):
@@ -143,8 +211,12 @@ class OutlineSearch:
         return self._finders[camera]
 
 
-def _part_of_axis(places: list[Float], axis: tuple[Float, Float, float]) -> tuple[Float, Float]:
-    """The part of an axis about the picked points, in {o}."""
-    direction = (axis[1] - axis[0]) / np.linalg.norm(axis[1] - axis[0])
-    along = [float((p - axis[0]) @ direction) for p in places] or [0.0]
-    return axis[0] + (min(along) - PART_M) * direction, axis[0] + (max(along) + PART_M) * direction
+def unmeasured_sigma(radius_m: float, range_m: float, focal_px: float) -> float:
+    """Sigma of a radius that nothing but edges has shown: they may lie within the pipe, and are a pixel wide."""
+    return float(np.hypot(INSET_SHARE * radius_m, range_m / focal_px))
+
+
+def _near(place: Float, others: dict[int, Float]) -> bool:
+    if not others:
+        return False
+    return bool((np.linalg.norm(place - np.array([*others.values()]), axis=1) < OUTLINE_SPACING_M).any())

@@ -11,7 +11,7 @@ from ..factors.projection import machine_projection, mobile_projection
 from ..frontends.undistort import distort, distortion_jacobian
 from .engine import Engine
 from .linear import LinearSystem
-from .pipes import SeenFrom
+from .pipe_parts import SeenFrom
 from .result import PickRecord, PickView
 
 Float = NDArray[np.float64]

@@ -69,8 +69,10 @@ class Pipeline:
         """What waited for something else gets its last chance."""
         self._outlines.go_on(to_the_end=True)
         self.engine.revisit()
+        self._outlines.complete()
         if self._base.search(self._depths.view, last=True):
             self.engine.revisit()
+        self._depths.begin_unknown()
         self._depths.search()
 
     def check(self, report: SensingReport) -> None:

@@ -1,14 +1,12 @@
 """Picks become points, outlines become pipes: what the operator named, in {o}."""
 
-from dataclasses import dataclass, field
-
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.measurements import OutlineSighting, Pick, Rejection
-from ..factors.noise import gaussian, robust, sigmas
+from ..factors.noise import floored, gaussian, robust, sigmas
 from ..factors.pipe import (
     axis_gauge,
     inset_prior,
@@ -21,70 +19,26 @@ from ..factors.pipe import (
 from ..factors.projection import depth_factor, machine_projection, mobile_projection
 from ..factors.rig import Pipe, Rig
 from .graph import Record, State, Update
+from .pipe_parts import PipeCylinder, PipePoint, SeenFrom, intersection
 
 Float = NDArray[np.float64]
 
 FAMILY = "picks"
 OUTLINE = "pipe outline"
+WIDTH = "pipe width"
 AXIS_ROLES = ("cut", "grasp")
-MINIMUM_PARALLAX_RAD = 0.03
-"""Below it two rays do not place a point well enough to start from."""
 WIDE_RADIUS_M = (0.05, 0.04)
 """Pipes that are cut by hand-guided machines: 20 to 180 mm diameter within two sigma; a prior that decides nothing."""
 GAUGE_HALF_LENGTH_M = 0.25
+LEAST_SPAN_M = 0.1
+"""Two picks nearer to each other give no direction."""
+PART_M = 0.1
+"""A pipe is taken to go on so far beyond its picks."""
 EDGE_FLOOR_PX = 0.3
 """Shading and a background of like brightness move an edge: rms on rendered recordings, beyond what its fit says."""
 INSET_SHARE = 0.05
 """Part of a pipe's radius by which its visible edges may lie within its outline, in all views alike: stripes of its
 finish, highlights and shadow have edges along the pipe as well. Rms over pipes in rendered recordings: 4.5 %."""
-
-
-@dataclass(frozen=True, slots=True)
-class SeenFrom:
-    """A pose that a camera hangs on: the key in the graph, and where the camera is believed to be."""
-
-    key: int
-    o_T_c: gtsam.Pose3
-
-
-@dataclass(slots=True)
-class _Point:
-    index: int
-    id: str
-    role: str
-    pipe: str | None
-    held: list[tuple[SeenFrom, Pick]] = field(default_factory=list)
-    known: bool = False
-    on_axis: bool = False
-    picks: int = 0
-    stamp_ns: int = 0
-
-
-@dataclass(slots=True)
-class _Cylinder:
-    index: int
-    pipe: Pipe
-    known: bool = False
-    held: list[tuple[SeenFrom, OutlineSighting]] = field(default_factory=list)
-    outlines: int = 0
-
-
-def known_point(
-    index: int,
-    name: str,
-    role: str,
-    pipe: str | None,
-    on_axis: bool,
-    picks: int,
-    stamp_ns: int,
-) -> _Point:
-    """A point that an earlier run knew."""
-    return _Point(index, name, role, pipe, known=True, on_axis=on_axis, picks=picks, stamp_ns=stamp_ns)
-
-
-def known_cylinder(index: int, pipe: Pipe, outlines: int) -> _Cylinder:
-    """A pipe that an earlier run knew."""
-    return _Cylinder(index, pipe, known=True, outlines=outlines)
 
 
 class Pipes:
@@ -93,8 +47,8 @@ class Pipes:
     def __init__(self, rig: Rig, state: State) -> None:
         self._rig = rig
         self._state = state
-        self.points: dict[str, _Point] = {}
-        self.cylinders: dict[str, _Cylinder] = {p.id: _Cylinder(i, p) for i, p in enumerate(rig.pipes)}
+        self.points: dict[str, PipePoint] = {}
+        self.cylinders: dict[str, PipeCylinder] = {p.id: PipeCylinder(i, p) for i, p in enumerate(rig.pipes)}
         self.rejected: list[Rejection] = []
         self.clicked: list[tuple[SeenFrom, Pick]] = []
         """Picks that are in the graph, in the order of their entry."""
@@ -137,16 +91,16 @@ class Pipes:
         self._attach(point, update)
         return update
 
-    def _point(self, pick: Pick) -> _Point:
+    def _point(self, pick: Pick) -> PipePoint:
         if pick.point_id not in self.points:
             pipe = self.pipe_of(pick.point_id) if pick.role in AXIS_ROLES else None
-            self.points[pick.point_id] = _Point(len(self.points), pick.point_id, pick.role, pipe)
+            self.points[pick.point_id] = PipePoint(len(self.points), pick.point_id, pick.role, pipe)
         return self.points[pick.point_id]
 
-    def _start(self, point: _Point, depth_m: tuple[float, float] | None) -> Float | None:
+    def _start(self, point: PipePoint, depth_m: tuple[float, float] | None) -> Float | None:
         """Where the point begins: from two rays with parallax, or from a measured depth."""
         rays = [self._ray(where, pick.camera, pick.px) for where, pick in point.held]
-        place = _intersection(rays)
+        place = intersection(rays)
         if place is not None:
             return place
         if depth_m is None:
@@ -161,8 +115,8 @@ class Pipes:
         direction = where.o_T_c.rotation().matrix() @ np.linalg.solve(K, np.array([px[0], px[1], 1.0]))
         return where.o_T_c.translation(), direction / np.linalg.norm(direction)
 
-    def _observe(self, point: _Point, where: SeenFrom, pick: Pick, update: Update) -> None:
-        covariance = pick.covariance_px2 + np.eye(2) * self._rig.noise.pick_floor_px**2
+    def _observe(self, point: PipePoint, where: SeenFrom, pick: Pick, update: Update) -> None:
+        covariance = floored(pick.covariance_px2, self._rig.noise.pick_floor_px)
         model = robust(gaussian(covariance), self._rig.gates.robust_sigma)
         key = keys.point(point.index)
         if pick.camera == "b_rgb":
@@ -176,7 +130,7 @@ class Pipes:
         point.stamp_ns = max(point.stamp_ns, pick.stamp_ns)
 
     def _observe_depth(
-        self, point: _Point, where: SeenFrom, pick: Pick, depth_m: tuple[float, float], update: Update
+        self, point: PipePoint, where: SeenFrom, pick: Pick, depth_m: tuple[float, float], update: Update
     ) -> None:
         """The surface's depth under a click. A point on the axis lies a radius behind it, and radii are only roughly
         known until the pipe's outline is seen: for it this says little, but enough to place one click."""
@@ -204,12 +158,12 @@ class Pipes:
             self._attach(point, update)
         return update
 
-    def _cylinder(self, pipe_id: str) -> _Cylinder:
+    def _cylinder(self, pipe_id: str) -> PipeCylinder:
         if pipe_id not in self.cylinders:
-            self.cylinders[pipe_id] = _Cylinder(len(self.cylinders), Pipe(id=pipe_id))
+            self.cylinders[pipe_id] = PipeCylinder(len(self.cylinders), Pipe(id=pipe_id))
         return self.cylinders[pipe_id]
 
-    def _start_pipe(self, cylinder: _Cylinder, update: Update) -> bool:
+    def _start_pipe(self, cylinder: PipeCylinder, update: Update) -> bool:
         """First axis and radius from the outlines and a point on the pipe."""
         anchor = next((p for p in self.points.values() if p.known and p.pipe == cylinder.pipe.id), None)
         if anchor is None or not self._state.has(keys.point(anchor.index)):
@@ -220,25 +174,36 @@ class Pipes:
             return False
         widths = [self._radius(where, sighting, place) for where, sighting in cylinder.held]
         radius = float(np.median(widths))
+        self._enter_pipe(cylinder, place, direction, radius, cylinder.held[0][1].stamp_ns, update)
+        return True
+
+    def begin(self, pipe_id: str, middle: Float, direction: Float, radius_m: float, stamp_ns: int) -> Update:
+        """A pipe that something else than edges has shown: its axis about a point of {o}; its picks lie on it now."""
+        update, cylinder = Update(), self._cylinder(pipe_id)
+        self._enter_pipe(cylinder, middle, direction / np.linalg.norm(direction), radius_m, stamp_ns, update)
+        for point in self.points.values():
+            self._attach(point, update)
+        return update
+
+    @staticmethod
+    def _enter_pipe(
+        cylinder: PipeCylinder, place: Float, direction: Float, radius: float, stamp_ns: int, update: Update
+    ) -> None:
+        """Axis and radius as variables, with what is known of any pipe."""
         i = cylinder.index
         ends = [place - GAUGE_HALF_LENGTH_M * direction, place + GAUGE_HALF_LENGTH_M * direction]
         for key, end in zip((keys.axis_start(i), keys.axis_end(i)), ends, strict=True):
             update.guess(key, end)
-            record = Record(
-                "gauge", "axis gauge", cylinder.held[0][1].stamp_ns, "place along the axis", rejectable=False
-            )
+            record = Record("gauge", "axis gauge", stamp_ns, "place along the axis", rejectable=False)
             update.add(axis_gauge(key, end, direction), record)
         update.guess(keys.radius(i), np.array([np.clip(radius, 0.005, 0.5)]))
         nominal = cylinder.pipe.nominal_diameter_m
         mean, sigma = (nominal / 2, cylinder.pipe.diameter_sigma_m / 2) if nominal else WIDE_RADIUS_M
-        record = Record(
-            "calibration priors", "pipe radius", cylinder.held[0][1].stamp_ns, "radius prior", rejectable=False
-        )
+        record = Record("calibration priors", "pipe radius", stamp_ns, "radius prior", rejectable=False)
         update.add(radius_prior(i, mean, sigma), record)
         cylinder.known = True
-        return True
 
-    def _direction(self, cylinder: _Cylinder, place: Float) -> Float | None:
+    def _direction(self, cylinder: PipeCylinder, place: Float) -> Float | None:
         """The axis lies in the middle plane of every outline: the direction across all their normals.
 
         One view fixes only the angle in the image; two views, or two points on the pipe, fix the direction. With one
@@ -278,7 +243,9 @@ class Pipes:
         distance = normals @ (place - where.o_T_c.translation())
         return float(-np.mean(distance))
 
-    def _observe_outline(self, cylinder: _Cylinder, where: SeenFrom, sighting: OutlineSighting, update: Update) -> None:
+    def _observe_outline(
+        self, cylinder: PipeCylinder, where: SeenFrom, sighting: OutlineSighting, update: Update
+    ) -> None:
         i = cylinder.index
         start, end = (
             update.values.atPoint3(k) if update.values.exists(k) else self._state.point(k)
@@ -321,7 +288,7 @@ class Pipes:
         record = Record("calibration priors", "pipe edges", stamp_ns, "inset of a pipe's edges", rejectable=False)
         update.add(inset_prior(pipe, INSET_SHARE * float(radius[0])), record)
 
-    def _attach(self, point: _Point, update: Update) -> None:
+    def _attach(self, point: PipePoint, update: Update) -> None:
         """Puts a point on the axis of its pipe, once both are known."""
         if not point.known or point.on_axis or point.pipe is None:
             return
@@ -341,6 +308,44 @@ class Pipes:
         i = cylinder.index
         radius = float(self._state.vector(keys.radius(i))[0])
         return self._state.point(keys.axis_start(i)), self._state.point(keys.axis_end(i)), radius
+
+    def known_part(self, pipe_id: str) -> tuple[Float, Float] | None:
+        """The part of a pipe's axis about its picks, {o}: by its cylinder, or before there is one by two picks."""
+        places, axis = self.places(pipe_id), self.axis(pipe_id)
+        if axis is not None:
+            start, direction = axis[0], axis[1] - axis[0]
+        else:
+            spans = [place - places[0] for place in places[1:]]
+            direction = max(spans, key=lambda span: float(np.linalg.norm(span)), default=np.zeros(3))
+            if np.linalg.norm(direction) < LEAST_SPAN_M:
+                return None
+            start = places[0]
+        direction = direction / np.linalg.norm(direction)
+        along = [float((p - start) @ direction) for p in places] or [0.0]
+        return start + (min(along) - PART_M) * direction, start + (max(along) + PART_M) * direction
+
+    def width(self, pipe_id: str, radius_m: float, sigma_m: float, stamp_ns: int) -> Update:
+        """A radius that was measured by something else than edges; empty while there is no cylinder."""
+        update, cylinder = Update(), self.cylinders.get(pipe_id)
+        if cylinder is not None and cylinder.known:
+            record = Record(WIDTH, "texture beside the pipe", stamp_ns, f"width of {pipe_id} by texture")
+            model = robust(sigmas([sigma_m]), self._rig.gates.robust_sigma)
+            update.add(gtsam.PriorFactorVector(keys.radius(cylinder.index), np.array([radius_m]), model), record)
+        return update
+
+    def outlined_of(self, pipe_id: str) -> list[tuple[SeenFrom, OutlineSighting]]:
+        """Outlines of one pipe that are in the graph."""
+        return [(where, seen) for where, seen in self.outlined if seen.pipe_id == pipe_id]
+
+    def take_back(self, pipe_id: str, stamps: set[int]) -> None:
+        """Outlines that leave the graph again."""
+        before = len(self.outlined)
+        self.outlined = [p for p in self.outlined if not (p[1].pipe_id == pipe_id and p[1].stamp_ns in stamps)]
+        self.cylinders[pipe_id].outlines -= before - len(self.outlined)
+
+    def named(self) -> list[str]:
+        """Pipes that something is known of."""
+        return list(dict.fromkeys([*self.cylinders, *(p.pipe for p in self.points.values() if p.pipe is not None)]))
 
     def places(self, pipe_id: str) -> list[Float]:
         """Points on a pipe as believed now, in {o}."""
@@ -362,18 +367,3 @@ class Pipes:
             for _, s in c.held
         ]
         return picks + outlines
-
-
-def _intersection(rays: list[tuple[Float, Float]]) -> Float | None:
-    """The point nearest to all rays, None without parallax."""
-    if len(rays) < 2:
-        return None
-    cosines = [abs(float(a[1] @ b[1])) for a in rays for b in rays]
-    if np.arccos(np.clip(min(cosines), -1, 1)) < MINIMUM_PARALLAX_RAD:
-        return None
-    projectors = [np.eye(3) - np.outer(d, d) for _, d in rays]
-    place = np.linalg.solve(
-        np.sum(projectors, axis=0), np.sum([P @ o for P, (o, _) in zip(projectors, rays, strict=True)], axis=0)
-    )
-    ahead = all(float((place - o) @ d) > 0.05 for o, d in rays)
-    return place if ahead else None

@@ -18,6 +18,24 @@ from .surfaces import Associator
 SETTLE_ROUNDS = 3
 
 
+def solved(engine: Engine) -> BatchSolution:
+    """Settles iSAM2, and refines in batch over the same factors.
+
+    Raises:
+        ObservabilityError: nothing ties the log together.
+    """
+    engine.revisit()
+    engine.flush()
+    if engine.odometry.last_keyframe < 0:
+        raise ObservabilityError(
+            "there is nothing to estimate: no stereo pair and no known marker was seen; check topics and marker ids in "
+            "the rig file (`surecut info LOG`)"
+        )
+    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
+    solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    return settle_boards(engine, solution)
+
+
 def finish(
     engine: Engine,
     between: tuple[tuple[str, str], ...] = (),
@@ -35,16 +53,7 @@ def finish(
     Raises:
         ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
     """
-    engine.revisit()
-    engine.flush()
-    if engine.odometry.last_keyframe < 0:
-        raise ObservabilityError(
-            "there is nothing to estimate: no stereo pair and no known marker was seen; check topics and marker ids in "
-            "the rig file (`surecut info LOG`)"
-        )
-    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
-    solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
-    solution = settle_boards(engine, solution)
+    solution = solved(engine)
     engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events

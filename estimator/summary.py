@@ -41,7 +41,7 @@ from .surroundings import Surroundings, compact_map, nearest_surface, surroundin
 from .trajectory import trajectory
 
 Float = NDArray[np.float64]
-LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "picks")
+LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "pipe width", "picks")
 """Families without each of which there may still be an estimate to compare with."""
 
 

@@ -7,8 +7,11 @@ track count as the others foretell them (Baarda 1968), and its variance is drawn
 whose width this log's tracks tell: errors with a multivariate t distribution (Lange, Little and Taylor 1989).
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.special import gammaln
 
 from ..factors import keys
@@ -22,11 +25,16 @@ FEWEST_TRACKS = 40
 """Tracks that tell how much their variances differ."""
 WIDTHS = (1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 25.0, 60.0)
 """Degrees of freedom of the distribution of variances that are tried: from tracks of all kinds to tracks all alike."""
-ALIKE = 60.0
+ALIKE = 0.5
+"""Where variances differ little and no track has a smaller weight, all keep theirs."""
 SCALES = np.exp(np.linspace(-0.5, 0.7, 25))
 """Typical variances that are tried, about the median of what the tracks show."""
 MOST = 1.5
 """A track counts for so much more than stated at most: few residuals may be small by chance."""
+LANDMARK = 3
+"""Coordinates of a point."""
+LIGHT = 0.03
+"""Share of a track's squared residual that its own pull on the estimate makes, up to which first order is enough."""
 ROUNDS = 2
 """A heavy track's residuals grow when it is no longer followed."""
 
@@ -34,8 +42,20 @@ Views = list[tuple[int, Int]]
 """Landmark, and the positions of its factors in the system."""
 
 
-def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int, float]:
-    """Information of each track over what it states, by the positions of its factors. Empty: the tracks are alike.
+@dataclass(frozen=True, slots=True)
+class TrackWeights:
+    by_position: dict[int, float]
+    """Information over what is stated, by the positions of factors; empty where tracks are alike."""
+    slack: float = 1.0
+    """Standard deviations of the estimate over those that weights known beforehand would give."""
+
+
+def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWeights:
+    """How much the tracks of a family are worth.
+
+    The weights come from the residuals themselves. A track that is more wrong gets less weight, so that the estimate
+    follows a small error by less than the weighted normal equations say: with w degrees of freedom of the variances and
+    d of the track by `(w + d) / (w + d + 2)`, on average (Lange, Little and Taylor 1989, section 5).
 
     Args:
         active: all factors of a system.
@@ -44,17 +64,21 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> dict[int
     """
     tracks = _views(active, family)
     if len(tracks) < FEWEST_TRACKS:
-        return {}
+        return TrackWeights({})
     weight = np.ones(len(tracks))
     spread: tuple[float, float] | None = None
+    dof = weight
     for _ in range(ROUNDS):
         chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
         spread = spread or spread_of_variances(chi2, dof)
         width, scale = spread
-        if width >= ALIKE:
-            return {}
         weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
-    return {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}
+        if width == WIDTHS[-1] and weight.min() > ALIKE:
+            return TrackWeights({})
+    slack = float(((spread[0] + dof + 2.0) / (spread[0] + dof) * dof).sum() / dof.sum()) if spread else 1.0
+    return TrackWeights(
+        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack
+    )
 
 
 def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> LinearSystem:
@@ -95,33 +119,46 @@ def _views(active: Active, family: str) -> Views:
 def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Float]:
     """Squared residuals (n,) of whole tracks in units of their covariance, and their degrees of freedom (n,).
 
-    Any place of the landmark would do, and what the track itself does to the estimate is taken out.
+    Any place of the landmark would do, and what the track itself does to the estimate is taken out. At the solution
+    the residuals of a track are orthogonal to its landmark, and to first order in its leverage H the square is
+    `r^T (1 + H) r`; only tracks for which that matters are looked at closely.
     """
     place, covariance = system.rest_covariance()
-    found = np.array([_residual(p, system.columns[key], system, place, covariance) for key, p in tracks])
-    return found[:, 0], np.maximum(found[:, 1], 1e-3)
+    rows = [_rows(system, positions) for _, positions in tracks]
+    chi2 = np.array([float(system.b[r] @ system.b[r]) for r in rows])
+    dof = np.array([max(len(r) - LANDMARK, 1e-3) for r in rows])
+    if covariance is None:
+        return chi2, dof
+    followed = _followed(rows, system, place, covariance)
+    for i in np.flatnonzero(followed > LIGHT * chi2):
+        chi2[i], dof[i] = _residual(rows[i], system.columns[tracks[i][0]], system, place, covariance)
+        followed[i] = 0.0
+    return chi2 + followed, dof
 
 
-def _residual(
-    positions: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float | None
-) -> tuple[float, float]:
+def _followed(rows: list[Int], system: LinearSystem, place: Int, covariance: Float) -> Float:
+    """`r^T H r` of every track, shape (n,)."""
+    every = np.concatenate(rows)
+    owner = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+    pull = csr_matrix((system.b[every], (owner, np.arange(len(every)))), shape=(len(rows), len(every)))
+    drawn = np.asarray((pull @ system.A[every])[:, np.flatnonzero(place >= 0)].todense())
+    return ((drawn @ covariance) * drawn).sum(axis=1)
+
+
+def _residual(rows: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float) -> tuple[float, float]:
     """`z^T (I - H)^-1 z` of what is left of the residuals when the landmark is eliminated, and its dimension."""
-    rows = _rows(system, positions)
     part = system.A[rows]
     columns = np.unique(part.indices)
     dense = np.zeros((len(rows), len(columns)))
     dense[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), np.searchsorted(columns, part.indices)] = part.data
     own = (columns >= landmark.start) & (columns < landmark.stop)
     free = np.linalg.qr(dense[:, own], mode="complete")[0][:, int(own.sum()) :].T
-    z = free @ system.b[rows]
-    if covariance is None:
-        return float(z @ z), float(len(z))
-    at, B = place[columns[~own]], free @ dense[:, ~own]
+    z, B, at = free @ system.b[rows], free @ dense[:, ~own], place[columns[~own]]
     hat = B @ covariance[np.ix_(at, at)] @ B.T
     eigenvalues, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
     known = eigenvalues > DETERMINED
     along = (vectors.T @ z)[known]
-    return float((along**2 / eigenvalues[known]).sum()), float(known.sum())
+    return float((along**2 / eigenvalues[known]).sum()), max(float(known.sum()), 1e-3)
 
 
 def _rows(system: LinearSystem, positions: Int) -> Int:

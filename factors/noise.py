@@ -17,6 +17,12 @@ def gaussian(covariance: Float) -> Model:
     return gtsam.noiseModel.Gaussian.Covariance(covariance)
 
 
+def floored(covariance: Float, sigma: float) -> Float:
+    """A covariance, shape (n, n), that is no better than `sigma` in any direction; what is worse stays as it is."""
+    variances, directions = np.linalg.eigh(covariance)
+    return np.asarray((directions * np.maximum(variances, sigma**2)) @ directions.T, np.float64)
+
+
 def sigmas(values: Float | list[float]) -> Model:
     """Independent components."""
     return gtsam.noiseModel.Diagonal.Sigmas(np.asarray(values, float))

@@ -155,6 +155,7 @@ class Noise(Section):
     """Part of a corner's error that is the same in views from the same place, at least: what the corner fit leaves on
     images without noise. A front end that sees more of it in the pixels says so with each sighting."""
     pick_floor_px: NonNegative = 0.3
+    """No click is better than this: it falls on a whole pixel, a step over root twelve."""
 
 
 class Gates(Section):

@@ -144,8 +144,8 @@ def _stereo_click(world: World, pick: Pick) -> ClickedPoint:
 
 def _pick(world: World, stamp_ns: int, point_id: str, role: str, exact_px: Float) -> Pick:
     settings, rng = world.scenario.picks, world.rng
-    # The model adds a floor to every click and every edge, and a campaign draws what the models say.
-    sigma_px = np.hypot(settings.sigma_px, world.rig.noise.pick_floor_px)
+    # No click is better than the model's floor, and a campaign draws what the models say.
+    sigma_px = max(settings.sigma_px, world.rig.noise.pick_floor_px)
     px = exact_px + rng.normal(0.0, sigma_px * world.scenario.noise_factors.picks, 2)
     if "picks" in world.scenario.outliers.families:
         px = spoil(px[None], world.scenario.outliers, world.outlier_rng)[0]

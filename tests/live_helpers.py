@@ -105,7 +105,16 @@ def update(number: int = 0, state: HealthState = HealthState.OK, faults: tuple[F
     grasp = LivePoint("P2", "grasp", np.array([0.1, 0.2, 1.0]), np.diag([1e-6, 4e-6, 9e-6]), "MEASURE MORE", 1.0)
     health = Health(state, faults)
     return LiveUpdate(
-        stamp_ns, stamp_ns + 12_000_000, poses, (cut, grasp), "MEASURE MORE: P2", 1.0, health, {"received": number}
+        stamp_ns,
+        stamp_ns + 12_000_000,
+        poses,
+        (cut, grasp),
+        "MEASURE MORE: P2",
+        1.0,
+        health,
+        {"received": number},
+        points_stamp_ns=stamp_ns - 50_000_000,
+        points_covariance_m2=np.diag([1e-6, 4e-6, 9e-6] * 2),
     )
 
 

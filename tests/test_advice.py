@@ -50,7 +50,7 @@ def another_click(run, stamp_ns, seed=0):
     place = transform(run.truth.o_T_b, run.truth.points_b_m["P1"])
     c_T_o = invert(run.truth.o_T_m[run.truth.stamps_ns.index(stamp_ns)])
     px = run.truth.rig.cameras["m_left"].K @ transform(c_T_o, place)
-    spread = np.hypot(COARSE_PX, run.rig.noise.pick_floor_px)
+    spread = max(COARSE_PX, run.rig.noise.pick_floor_px)
     px = px[:2] / px[2] + rng.normal(0.0, spread, 2)
     return Pick(stamp_ns, "m_left", "P1", "cut", px, px, COARSE_PX**2 * np.eye(2))
 

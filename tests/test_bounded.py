@@ -11,6 +11,7 @@ from surecut.estimator.graph import Record, Update
 from surecut.estimator.incremental import Cut, Incremental
 from surecut.estimator.limits import Limits
 from surecut.estimator.marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
+from surecut.estimator.observability import Undetermined
 from surecut.estimator.points_in_base import point_blocks
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors import keys
@@ -170,6 +171,33 @@ def shifted(values, wanted):
     for key in wanted:
         found.insert(key, values.atPoint3(key) + 0.1)
     return found
+
+
+def test_landmark_with_one_view_left_is_named_and_can_be_given_up():
+    """Getting across it by Levenberg-Marquardt takes seconds; the cut goes on without it instead."""
+    update, noise = Update(), gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
+    lens = gtsam.Cal3DS2(300, 300, 0, 180, 120, 0, 0, 0, 0)
+    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+    for i in range(2):
+        pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.2 * i, 0.0, 0.0]))
+        update.guess(keys.keyframe(i), pose)
+        update.add(gtsam.PriorFactorPose3(keys.keyframe(i), pose, held), Record("gauge", "gauge", i, "pose"))
+        for mark in range(2):
+            seen = gtsam.PinholeCameraCal3DS2(pose, lens).project(np.array([0.1, 0.3 * mark, 2.0]))
+            args = seen, noise, keys.keyframe(i), keys.landmark(mark), lens
+            view = gtsam.GenericProjectionFactorCal3DS2(*args)
+            update.add(view, Record("stereo odometry", "m_left", i, f"track {mark}", camera="m_left"))
+    for mark in range(2):
+        update.guess(keys.landmark(mark), np.array([0.1, 0.3 * mark, 2.0]))
+    solver = Incremental()
+    solver.update(update)
+    solver.log.off.add(5)  # the second keyframe's view of landmark 1 was an outlier
+    cut = Cut({keys.keyframe(0)}, set(), set())
+    with pytest.raises(Undetermined, match="landmark 1"):
+        solver.reduce(cut, 2)
+    left = solver.reduce(cut.giving_up(keys.landmark(1)), 2)
+    assert set(left.keys()) == {keys.keyframe(1), keys.landmark(0)}
+    np.testing.assert_allclose(left.atPoint3(keys.landmark(0)), [0.1, 0.0, 2.0], atol=1e-6)
 
 
 def test_cut_is_of_what_there_is():

@@ -58,6 +58,8 @@ def test_a_line_per_update():
         "verdict": "GO",
         "age_s": 0.25,
     }
+    assert found[0]["points_stamp_ns"] == update(0).points_stamp_ns
+    assert found[0]["points_covariance_m2"] == np.diag([1e-6, 4e-6, 9e-6] * 2).tolist()
     assert found[0]["verdict"] == "MEASURE MORE: P2"
     assert found[0]["health"] == {"state": "ok", "faults": []}
     assert np.shape(found[0]["poses"]["m"]["matrix"]) == (4, 4)

@@ -8,6 +8,7 @@ from surecut.estimator.pipes import EDGE_FLOOR_PX
 from surecut.factors.cloud import corrected
 from surecut.factors.errors import RigError
 from surecut.factors.measurements import CloudFrame, MarkerSighting, OutlineSighting, Pick, StereoFrame
+from surecut.factors.noise import floored
 from surecut.factors.outline import outline_noise, outline_residual
 from surecut.simulation.measurement_level import draw
 from surecut.simulation.measurement_level_scenario import Scenario, load_scenarios
@@ -140,7 +141,7 @@ def test_picks_and_outlines(runs):
         for pick in of(run, Pick):
             point_o = transform(truth.o_T_b, truth.points_b_m[pick.point_id])
             exact = project(camera, m_T_o(run, pick.stamp_ns), point_o[None])[0]
-            model = pick.covariance_px2 + run.rig.noise.pick_floor_px**2 * np.eye(2)
+            model = floored(pick.covariance_px2, run.rig.noise.pick_floor_px)
             clicks.append(whitened((pick.px - exact)[None], model[None]))
         for outline in of(run, OutlineSighting):
             c_T_b = m_T_o(run, outline.stamp_ns) @ truth.o_T_b
@@ -167,7 +168,7 @@ def test_wrong_noise_has_the_asked_factor(family):
             for stamp in {pick.stamp_ns for pick in of(run, Pick)}:
                 px = [p.px for p in of(run, Pick) if (p.point_id, p.stamp_ns) == (point_id, stamp)]
                 values.append((px - np.mean(px, axis=0)).ravel() * np.sqrt(40 / 39))
-        stated = np.hypot(scenario.picks.sigma_px, run.rig.noise.pick_floor_px)
+        stated = max(scenario.picks.sigma_px, run.rig.noise.pick_floor_px)
     else:
         for sighting in of(run, MarkerSighting):
             page = run.truth.rig.boards["f0"]

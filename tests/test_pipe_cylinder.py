@@ -10,6 +10,7 @@ from surecut.factors.measurements import CylinderSighting, Rejection
 from surecut.frontends.cloud.noise import depth_noise
 from surecut.frontends.open3d_loader import load_open3d
 from surecut.frontends.pipe.cylinder import CylinderFit, fit_cylinder
+from surecut.frontends.pipe.depth_cylinder import PredictedPipe, cylinder_near
 from surecut.frontends.pipe.segment import kinect_cylinder
 
 AXIS, POINT, RADIUS = np.array([0.1, 0.98, -0.17]), np.array([0.1, 0.0, 1.2]), 0.045
@@ -72,6 +73,50 @@ def test_a_neighbour_and_a_wall_do_not_capture_the_fit():
     fit = fit_cylinder(points, np.full(len(points), 0.0015), radius_prior_m=(0.045, 0.003))
     assert isinstance(fit, CylinderFit)
     assert np.abs(parameters(fit)[[0, 1, 4]]).max() < 0.004
+
+
+def elbow(rng, count=900, bend_m=0.09):
+    """A quarter bend at the end of the pipe, the half that the camera sees."""
+    axis = AXIS / np.linalg.norm(AXIS)
+    side = np.cross(axis, POINT / np.linalg.norm(POINT))
+    side /= np.linalg.norm(side)
+    turn, round_ = rng.uniform(0, np.pi / 2, count)[:, None], rng.uniform(0, 2 * np.pi, count)[:, None]
+    centre = POINT + 0.2 * axis + bend_m * side
+    outwards = -np.cos(turn) * side + np.sin(turn) * axis
+    normal = np.cos(round_) * outwards + np.sin(round_) * np.cross(axis, side)
+    points = centre + bend_m * outwards + RADIUS * normal
+    return points[(normal * points).sum(axis=1) < 0] + rng.normal(0, 0.0015, 3)
+
+
+def flange(rng, count=500, at_m=0.05):
+    """A collar of 1.4 radii, 3 cm long: what of it the camera sees."""
+    axis = AXIS / np.linalg.norm(AXIS)
+    points = visible_surface(rng, count)
+    along = (points - POINT) @ axis
+    outwards = points - POINT - along[:, None] * axis
+    return POINT + (at_m + 0.03 * rng.uniform(-0.5, 0.5, (count, 1))) * axis + 1.4 * outwards
+
+
+@pytest.mark.parametrize("what", ["elbow", "flange", "nearly parallel neighbour"])
+def test_what_is_normal_beside_a_pipe_does_not_bend_it(what):
+    rng = np.random.default_rng(5)
+    pipe, axis = visible_surface(rng), AXIS / np.linalg.norm(AXIS)
+    if what == "elbow":
+        other = elbow(rng)
+    elif what == "flange":
+        other = flange(rng)
+    else:  # two degrees off, its wall 6 cm beside
+        other = visible_surface(rng, 2000)
+        lean = np.deg2rad(2.0) * ((other - POINT) @ axis)[:, None] * np.array([1.0, 0.0, 0.0])
+        other = other + np.array([2 * RADIUS + 0.06, 0.0, 0.02]) + lean
+    off = np.array([0.006, 0.0, -0.006])
+    predicted = PredictedPipe(POINT - 0.3 * axis + off, POINT + 0.3 * axis + off, RADIUS + 0.003, 0.01)
+    found = cylinder_near(1, "pipe0", np.vstack((pipe, other)), "kinect_v1", predicted)
+    assert isinstance(found, CylinderSighting), found
+    way = found.point_b_m - found.point_a_m
+    assert found.radius_m == pytest.approx(RADIUS, abs=0.003)
+    assert abs(way @ axis) > np.cos(np.deg2rad(1.0)) * np.linalg.norm(way)
+    assert np.linalg.norm(np.cross(found.point_a_m - POINT, axis)) < 0.004
 
 
 def test_sphere_plane_and_noise_are_refused():

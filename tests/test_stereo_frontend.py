@@ -1,5 +1,8 @@
 """The stereo front end on rendered rooms with known motion, and on a real drive."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -31,8 +34,12 @@ def rendered():
     return poses, [room.pair(o_T_m) for o_T_m in poses]
 
 
-def front_end():
-    return StereoFrontEnd(camera(), camera("m_right"), left_T_right())
+DENSE = StereoSettings(keyframe_parallax=0.05, keyframe_rotation_rad=0.12, keyframe_share=0.75, min_tracks=90)
+"""Keyframes enough in a walk of two seconds for statistics over them."""
+
+
+def front_end(settings=DENSE):
+    return StereoFrontEnd(camera(), camera("m_right"), left_T_right(), settings)
 
 
 def run(pairs, noise=2.0, gain=1.0, seed=0, front=None):
@@ -42,6 +49,17 @@ def run(pairs, noise=2.0, gain=1.0, seed=0, front=None):
         front.process((i + 1) * STEP_NS, expose(left, rng, noise, gain), expose(right, rng, noise, gain))
         for i, (left, right, _) in enumerate(pairs)
     ]
+
+
+def test_a_pair_whose_place_matters_is_a_keyframe(rendered):
+    _, pairs = rendered
+    front, rng = front_end(), np.random.default_rng(5)
+    frames = [
+        front.process((i + 1) * STEP_NS, expose(left, rng, 2.0, 1.0), expose(right, rng, 2.0, 1.0), wanted=i == 2)
+        for i, (left, right, _) in enumerate(pairs[:4])
+    ]
+    assert [frame.is_keyframe for frame in frames] == [True, False, True, False]
+    assert np.isfinite(frames[2].right_px[:, 0]).sum() > 30
 
 
 def chained(frames):
@@ -161,6 +179,20 @@ def test_motion_and_keyframes_of_a_walk(rendered):
         assert (np.linalg.eigvalsh(frame.left_covariance_px2) > 0).all()
         right = np.isfinite(frame.right_px[:, 0])
         assert (np.linalg.eigvalsh(frame.right_covariance_px2[right]) > 0).all()
+
+
+def test_the_walk_with_the_default_keyframes(rendered):
+    """Few of them, and the tracks last from one to the next."""
+    truth, pairs = rendered
+    frames = run(pairs, front=front_end(StereoSettings()))
+    keyframes = [frame for frame in frames if frame.is_keyframe]
+    assert not any(frame.lost for frame in frames)
+    assert 2 <= len(keyframes) <= 8
+    for before, after in pairwise(keyframes):
+        assert len(set(before.track_ids.tolist()) & set(after.track_ids.tolist())) > 40
+    position, angle = errors(frames, truth).T
+    assert position.max() < 0.03
+    assert angle.max() < 0.5
 
 
 def test_blur_widens_covariances(rendered):
@@ -292,7 +324,7 @@ def test_a_loop_is_closed_after_a_drift(rendered):
     """The chain is put 0.4 m and 5 degrees off on the way: the way back is found by the place, not by the chain."""
     _, pairs = rendered
     order = [*range(40), *range(39, -1, -1)]
-    front = StereoFrontEnd(camera(), camera("m_right"), left_T_right(), StereoSettings(loop_ns=1_500_000_000))
+    front = StereoFrontEnd(camera(), camera("m_right"), left_T_right(), replace(DENSE, loop_ns=1_500_000_000))
     first = run([pairs[i] for i in order[:45]], front=front)
     before = {i for frame in first[:25] for i in frame.track_ids.tolist()}
     front._chain_T_keyframe = front._chain_T_keyframe @ exponential(np.array([0.0, 0.09, 0.0, 0.3, 0.1, -0.25]))

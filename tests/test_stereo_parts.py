@@ -142,12 +142,12 @@ def test_noise_has_no_corners():
 
 def test_keyframe_reasons():
     settings, still = StereoSettings(), np.zeros((50, 2))
-    turned = exponential(np.array([0.0, 0.2, 0.0, 0, 0, 0]))
+    turned = exponential(np.array([0.0, 0.4, 0.0, 0, 0, 0]))
     assert keyframe_reason(still, np.eye(4), 20, 200, 433, settings) is None
-    assert keyframe_reason(still + 30, np.eye(4), 200, 200, 433, settings) == "parallax"
+    assert keyframe_reason(still + 60, np.eye(4), 200, 200, 433, settings) == "parallax"
     assert keyframe_reason(still + 5, turned, 200, 200, 433, settings) == "rotation"
-    assert keyframe_reason(still + 5, np.eye(4), 140, 200, 433, settings) == "share"
-    assert keyframe_reason(still + 5, np.eye(4), 80, 95, 433, settings) == "few tracks"
+    assert keyframe_reason(still + 5, np.eye(4), 90, 200, 433, settings) == "share"
+    assert keyframe_reason(still + 5, np.eye(4), 50, 60, 433, settings) == "few tracks"
     assert keyframe_reason(still + 5, np.eye(4), 180, 200, 433, settings) is None
 
 

@@ -109,6 +109,12 @@ def test_answer_is_back_after_kill(streamed, offline, tmp_path):
             assert point["verdict"] != "GO"
         found = first_line(port, 60, lambda update: "m" in update["poses"])
         assert "relocalising" not in {fault["name"] for fault in found["health"]["faults"]}
+        joint = np.array(found["points_covariance_m2"])
+        for i, point in enumerate(found["points"]):
+            own = joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+            np.testing.assert_allclose(own, point["covariance_m2"], rtol=1e-6, atol=1e-12)
+        assert np.linalg.eigvalsh(joint).min() > 0
+        assert np.abs(joint[:3, 3:6]).max() > 0  # they share the machine
         begun, now = (np.array(line["poses"]["b"]["matrix"]) for line in (update, found))
         np.testing.assert_allclose(now, begun, atol=0.02)  # the same {o}
         process.send_signal(signal.SIGKILL)

@@ -1,6 +1,9 @@
 """The parts of the stream by themselves: order of live messages, health by name, poses between keyframes, trust."""
 
+import os
+import time
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -8,12 +11,16 @@ import pytest
 from stream_messages import LEFT, MS, RIG, RIGHT, START, image
 
 from surecut.estimator.decision import Decision
+from surecut.estimator.observability import Undetermined
+from surecut.estimator.stream.aside import Aside
 from surecut.estimator.stream.follower import Follower
 from surecut.estimator.stream.ordering import LiveOrder
 from surecut.estimator.stream.settings import StreamSettings
 from surecut.estimator.stream.thinning import Thinning
 from surecut.estimator.stream.trust import EXPIRED, grown, verdict_of
 from surecut.estimator.stream.wire import Frame, Place
+from surecut.factors import keys
+from surecut.factors.errors import SurecutError
 from surecut.factors.measurements import StereoFrame
 from surecut.factors.rig import Cut
 from surecut.io.messages import Message, PickBody
@@ -168,6 +175,22 @@ def test_pose_between_keyframes_and_its_covariance():
     assert np.sqrt(lost.covariance[3, 3]) > 0.02  # half a metre per second, for a twentieth
 
 
+def test_keyframe_in_the_making_has_a_pose_and_counts_once():
+    follower = Follower()
+    follower.frame(frame(0, True))
+    follower.anchor(START, Place(step(1.0), 1e-6 * np.eye(6)))
+    early = follower.frame(replace(frame(1), early=True))
+    np.testing.assert_allclose(early.matrix, step(1.01), atol=1e-12)
+    assert early.stamp_ns == frame(1).stamp_ns
+    again = follower.anchor(START, Place(step(2.0), 1e-6 * np.eye(6)))  # meanwhile the graph knows better
+    np.testing.assert_allclose(again.matrix, step(2.01), atol=1e-12)
+    assert again.stamp_ns == frame(1).stamp_ns
+    done = follower.frame(replace(frame(1, keyframe=True), last_T_this=step(0.012)))
+    np.testing.assert_allclose(done.matrix, step(2.012), atol=1e-12)
+    assert np.trace(done.covariance) > np.trace(early.covariance)
+    np.testing.assert_allclose(follower.frame(frame(2)).matrix, step(2.022), atol=1e-12)
+
+
 def test_wrong_motions_widen_the_pose():
     good, bad = Follower(), Follower()
     for follower, off in ((good, 0.0), (bad, 0.02)):
@@ -184,6 +207,60 @@ def test_covariance_grows_as_its_formula_says():
     settings = StreamSettings(unseen_walk_m_per_root_s=0.001, unseen_turn_rad_per_root_s=0.01)
     covariance = grown(np.zeros((3, 3)), np.array([0.0, 0.0, 2.0]), 4.0, settings)
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [np.hypot(0.002, 0.04)] * 2 + [0.002], rtol=1e-9)
+
+
+def test_points_creep_together():
+    """The joint covariance of two points holds each one's own, and the machine's creep in both alike."""
+    settings = StreamSettings(unseen_walk_m_per_root_s=0.001, unseen_turn_rad_per_root_s=0.01)
+    places = np.array([[0.0, 0.0, 2.0], [0.1, -0.2, 1.5]])
+    joint = grown(np.zeros((6, 6)), places, 4.0, settings)
+    for i in range(2):
+        own = joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        np.testing.assert_allclose(own, grown(np.zeros((3, 3)), places[i], 4.0, settings), atol=1e-15)
+    apart = np.hstack([np.eye(3), -np.eye(3)])
+    walk_only = grown(np.zeros((6, 6)), places, 4.0, replace(settings, unseen_turn_rad_per_root_s=0.0))
+    np.testing.assert_allclose(apart @ walk_only @ apart.T, 0.0, atol=1e-15)
+    assert np.linalg.eigvalsh(joint).min() > -1e-15
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_work_aside_comes_back_or_says_why(apart):
+    aside, state = Aside(apart), [1]
+
+    def result():
+        until = time.monotonic() + 10
+        while (found := aside.taken()) is None and time.monotonic() < until:
+            time.sleep(0.01)
+        return found
+
+    def work():
+        state.append(2)
+        return b"x" * 300_000 + bytes(state)
+
+    aside.begin(work)
+    assert aside.busy()
+    assert result() == b"x" * 300_000 + b"\x01\x02"
+    assert state == ([1] if apart else [1, 2])  # a copy changes nothing here
+    assert not aside.busy()
+    for error, told in (
+        (Undetermined(keys.landmark(7)), "landmark 7"),
+        (ZeroDivisionError("by nothing"), "by nothing"),
+    ):
+        aside.begin(partial(throw, error))
+        with pytest.raises(SurecutError, match=told):
+            result()
+    if apart:
+        aside.begin(lambda: os._exit(3))
+        with pytest.raises(SurecutError, match="died"):
+            result()
+        aside.begin(lambda: time.sleep(60))
+        aside.stop()
+    assert not aside.busy()
+
+
+def throw(error):
+    raise error
 
 
 def test_verdict_expires():

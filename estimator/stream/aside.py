@@ -9,8 +9,11 @@ import os
 import pickle
 import select
 import signal
+import traceback
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
+
+from ...factors.errors import SurecutError
 
 Made = TypeVar("Made")
 
@@ -31,7 +34,7 @@ class Aside(Generic[Made]):
         self._pid = 0
         self._end = -1
         self._said = b""
-        self._result: list[Made | Exception] = []
+        self._result: list[Made | SurecutError] = []
 
     def busy(self) -> bool:
         """Is a piece of work under way, or its result not taken yet?"""
@@ -54,13 +57,13 @@ class Aside(Generic[Made]):
         """The result, once; None while there is none.
 
         Raises:
-            Exception: what the work has raised.
+            SurecutError: what the work has raised, or what it died of.
         """
         self._read()
         if not self._result:
             return None
         found = self._result.pop()
-        if isinstance(found, Exception):
+        if isinstance(found, SurecutError):
             raise found
         return found
 
@@ -86,11 +89,16 @@ class Aside(Generic[Made]):
         self._pid, self._end = 0, -1
 
 
-def _done(work: Callable[[], Made]) -> Made | Exception:
+def _done(work: Callable[[], Made]) -> Made | SurecutError:
     try:
         return work()
-    except Exception as error:
+    except SurecutError as error:
         return error
+    except Exception as error:  # a defect: to be told, but no reason to end a shift
+        what = traceback.extract_tb(error.__traceback__)[-1]
+        return SurecutError(
+            f"{type(error).__name__} in {what.name}, line {what.lineno}: {' '.join(str(error).split())}"
+        )
 
 
 def _copy(work: Callable[[], object], end: int) -> None:
@@ -106,4 +114,4 @@ def _copy(work: Callable[[], object], end: int) -> None:
 
 def _understood(said: bytes) -> Any:
     """From our own copy: nothing that comes from outside is ever unpickled."""
-    return pickle.loads(said) if said else RuntimeError("a copy of the process died at its work; is there memory?")
+    return pickle.loads(said) if said else SurecutError("a copy of the process died at its work; is there memory?")

@@ -12,6 +12,7 @@ from ..consistency import family_tests, judge, prior_tests
 from ..engine import Engine
 from ..linearised import linearise, with_correlated_tracks
 from ..marginal import FAMILY
+from ..observability import determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
 from ..result import Consistency
@@ -32,7 +33,8 @@ class Audit:
 def relinearised(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     """One Newton step on: residuals at an old linearisation are not the data's. The running estimate stays as it is,
     so that looking does not change what comes after."""
-    return values.retract(graph.linearize(values).optimize())
+    with determined():
+        return values.retract(graph.linearize(values).optimize())
 
 
 def audit(engine: Engine) -> Audit:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
+from ...factors.measurements import Pick
 from ...factors.rig import Rig, sha256_of
 from ..bounded import Bounded
 from ..decision import Decision, decide
@@ -22,6 +23,8 @@ from ..validated_range import ValidatedRange
 from .aside import Aside
 from .audit import Audit, audit
 from .calibration import departures, held, hold
+from .glances import Glance
+from .knocks import Knocks
 from .memory import Memory, recall, remember, save
 from .posterior import Posterior, posterior_of
 from .settings import S, StreamSettings
@@ -42,7 +45,8 @@ class GraphLoop:
         tell: takes each answer.
         memory: what an earlier run knew.
         checkpoint: file that is kept up to date; None for none.
-        apart: the audit and the checkpoint are made by copies of the process, so that no answer waits for them.
+        apart: somebody waits for answers: they come by the computer's clock too, and the audit and the checkpoint are
+            made by copies of the process.
     """
 
     def __init__(
@@ -67,11 +71,13 @@ class GraphLoop:
         if memory is not None:
             recall(self.engine, memory)
             self._bounded.first = memory.keyframes
+        self._knocks = Knocks(self.engine)
         self._audit = Audit()
         self._auditing: Aside[Audit] = Aside(apart)
         self._saving: Aside[str] = Aside(apart)
+        self._live = apart
         self._told_s = 0.0
-        """When the last answer was told, by the computer's clock."""
+        """When an answer was last due, by the computer's clock."""
         self._next_audit_ns = self._next_answer_ns = 0
         self._saved_s = time.monotonic()
         self._answer: Answer | None = None
@@ -102,8 +108,9 @@ class GraphLoop:
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
-        self._bounded.tidy()
         self._answer_when_due(sensed.stamp_ns, clicked, busy)
+        self._bounded.tidy()
+        self._answer_when_due(sensed.stamp_ns, False, busy)
 
     def _told(self) -> tuple[int, int]:
         """Changes with each factor that enters or leaves."""
@@ -117,6 +124,28 @@ class GraphLoop:
         self._changed |= taken
         self._answer_when_due(self.engine.end_ns, True, False)
         return taken
+
+    def glance(self, glance: Glance) -> None:
+        """Markers in a frame that is no keyframe."""
+        try:
+            changed = self._knocks.see(glance)
+        except ObservabilityError:
+            self.counts["undetermined"] += 1
+            return
+        self.counts["glances"] += 1
+        self._changed |= changed
+        if changed:
+            self.answer(glance.frame.stamp_ns)
+
+    def unplaced(self, sensed: Sensed) -> list[Pick]:
+        """Clicks in pictures that have passed, of which nothing is known any more."""
+        engine = self.engine
+        if engine.waiting:
+            return []  # a board may yet tell where these were made
+        passed = [p for p in sensed.bundle.picks if p.camera != "b_rgb" and p.stamp_ns < engine.end_ns]
+        found = [p for p in passed if engine.seen_from(p.camera, p.stamp_ns) is None]
+        self.counts["picks_too_late"] += len(found)
+        return found
 
     def freeze(self, on: bool) -> str:
         """Holds the calibration, or lets it go."""
@@ -134,12 +163,14 @@ class GraphLoop:
         period = self._settings.answer_period_ns
         if self._next_answer_ns - stamp_ns > 2 * period:
             self._next_answer_ns = 0  # the clock was set back
-        if stamp_ns < self._next_answer_ns and not at_once:
+        waited = time.monotonic() - self._told_s >= period / S
+        if stamp_ns < self._next_answer_ns and not at_once and not (waited and self._live):
             return
-        if busy and time.monotonic() - self._told_s < period / S:
+        if busy and not (waited or at_once):
             return  # what waits passes faster than it was measured
         self._next_answer_ns = stamp_ns + period
         self.answer(stamp_ns)
+        self._told_s = time.monotonic()
 
     def mark_changed(self) -> None:
         """The next answer is made anew."""
@@ -159,9 +190,10 @@ class GraphLoop:
             self._answer = replace(
                 self._answer, stamp_ns=stamp_ns, decisions=decisions, last_tie_ns=self.engine.boards.last_seen_ns()
             )
-        self._answer = replace(self._answer, counts=dict(self.counts), cpu_s=time.process_time())
+        self._answer = replace(
+            self._answer, counts=dict(self.counts), cpu_s=time.process_time(), suspects=self._knocks.suspects
+        )
         self._tell(self._answer)
-        self._told_s = time.monotonic()
         return self._answer
 
     def _maybe_audit(self, stamp_ns: int) -> None:
@@ -179,8 +211,8 @@ class GraphLoop:
         """The audit's outcome, when it is there."""
         try:
             found = self._auditing.taken()
-        except ObservabilityError:
-            self.counts["undetermined"] += 1
+        except SurecutError:
+            self.counts["audits_failed"] += 1
             return
         if found is not None:
             self._audit, self._changed = found, True

@@ -2,11 +2,14 @@
 
 import queue
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ...factors.errors import SurecutError
+from ...factors.measurements import Pick
 from ..sensing import Sensed
+from .glances import Glance
 from .graph_loop import GraphLoop
 from .memory import load
 from .parent import GRAPH_NICE, end_with_parent, give_way, keep_loaded
@@ -33,6 +36,9 @@ def solve(task: GraphTask, inbox: Any, out: Any) -> None:
                 continue
             if isinstance(item, Sensed):
                 loop.take(item, _waiting(inbox) > BUSY)
+                _refuse(loop.unplaced(item), out)
+            elif isinstance(item, Glance):
+                loop.glance(item)
             elif isinstance(item, LateClick):
                 _look_back(loop, item, out)
             elif isinstance(item, Order):
@@ -62,7 +68,11 @@ def _waiting(inbox: Any) -> int:
 
 def _look_back(loop: GraphLoop, item: LateClick, out: Any) -> None:
     if not loop.look_back(item.sensed):
-        pick = item.sensed.bundle.picks[0]
+        _refuse(item.sensed.bundle.picks[:1], out)
+
+
+def _refuse(picks: Sequence[Pick], out: Any) -> None:
+    for pick in picks:
         text = f"pick {pick.point_id} at {pick.stamp_ns} ns: its frame cannot be placed any more; pick in a newer image"
         out.put(Done("pick", text, failed=True))
 

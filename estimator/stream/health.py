@@ -212,6 +212,7 @@ class Monitor:
                 faults.append(("board_knocked", event.text, Severity.WARNING))
             elif event.severity == "error":
                 faults.append((event.kind, event.text, Severity.ERROR))
+        faults += [(event.kind, event.text, Severity.ERROR) for event in answer.suspects]
         if not answer.consistent:
             reason = answer.reasons[0] if answer.reasons else "residuals"
             faults.append(("inconsistent", f"the data contradict the model: {reason}", Severity.WARNING))

@@ -20,7 +20,7 @@ from ...factors.camera import CameraModel
 from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
 from ...io.reader import LogReader
-from ..batch import BatchSolution, without_factors
+from ..batch import BatchSolution
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
@@ -69,14 +69,14 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     """
     if not engine.boards.any_known() or engine.graph.unsolved:
         return None
-    log, values = engine.solver.log, engine.state.values
-    graph = log.graph()
-    if solution is not None:
-        values, graph = solution.values, without_factors(log, set(solution.outliers))
+    if solution is None:
+        prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
+    else:
+        prior = gaussian_of(solution.at.graph(), solution.values, long_lived(solution.values))
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
-        prior=gaussian_of(graph, values, long_lived(values)),
+        prior=prior,
         cameras=dict(engine.cameras),
         boards=[
             {

@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 
-LOOK_NICE, GRAPH_NICE = 10, 15
+LOOK_NICE, GRAPH_NICE = 5, 10
 """Niceness: the pose of the camera goes before markers and surfaces, and these before the graph."""
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ...factors.errors import ObservabilityError
 from ..engine import Engine
-from ..marginal import GaussianPrior, gaussian_of
+from ..marginal import GaussianPrior
 from .variables import long_lived
 
 Float = NDArray[np.float64]
@@ -59,4 +59,4 @@ class Posterior:
 def posterior_of(engine: Engine, more: Sequence[int] = ()) -> Posterior:
     """The variables that live on, and `more`."""
     stay = [*long_lived(engine.state.values), *more]
-    return Posterior(gaussian_of(engine.solver.log.graph(), engine.state.values, stay))
+    return Posterior(engine.solver.joint_gaussian(stay))

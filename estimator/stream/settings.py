@@ -33,6 +33,8 @@ class StreamSettings:
     """Points in {b} with covariance at least so often, while measurements come."""
     views_at_once: int = 4
     """Pictures that are searched for a pipe's outline before the next answer."""
+    glance_period_ns: int = 400 * MS
+    """Between looks at the boards while there are no keyframes: a knock is to be told within two seconds."""
     audit_period_ns: int = 20 * S
     """Between tests of the model against its own data."""
     checkpoint_period_s: float = 5.0

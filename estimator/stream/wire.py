@@ -116,6 +116,8 @@ class Answer:
     """Of the cut plan, as if asked at the last look at a board."""
     calibration: tuple[CalibrationEstimate, ...] = ()
     events: tuple[Event, ...] = ()
+    suspects: tuple[Event, ...] = ()
+    """Boards that seem to have been knocked, and about which the graph has not decided."""
     last_tie_ns: int | None = None
     """When a board that ties {b} was last seen."""
     consistent: bool = True

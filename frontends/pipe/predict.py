@@ -11,6 +11,7 @@ Float = NDArray[np.float64]
 
 _NEAREST_M = 0.1
 _BORDER_PX = 10.0
+_POINTS = 101
 
 
 def predict_outline(
@@ -30,18 +31,29 @@ def predict_outline(
         rotation_sigma_rad: Standard deviation of its direction.
         radius_sigma_m: Standard deviation of the radius.
     """
-    points = point_a + np.linspace(0, 1, 101)[:, None] * (point_b - point_a)
-    points = points[points[:, 2] > _NEAREST_M]
-    px = points @ camera.K.T
-    px = px[:, :2] / px[:, 2:]
-    seen = (px > _BORDER_PX).all(axis=1) & (px < np.array([camera.width, camera.height]) - _BORDER_PX).all(axis=1)
-    if seen.sum() < 2:
+    points = _in_sight(camera, point_a, point_b)
+    if len(points) < 2:
         return None
-    middle = points[seen][len(points[seen]) // 2]
+    middle = points[len(points) // 2]
     lines = outline_lines(middle, point_b - point_a, radius_m, camera.K)
     if lines is None:
         return None
     return _prior(camera, middle, lines, position_sigma_m, rotation_sigma_rad, radius_sigma_m)
+
+
+def part_in_sight(camera: CameraModel, point_a: Float, point_b: Float) -> bool:
+    """Does an image show at least a third of the axis between two points of the camera's frame?"""
+    return 3 * len(_in_sight(camera, point_a, point_b)) > _POINTS
+
+
+def _in_sight(camera: CameraModel, point_a: Float, point_b: Float) -> Float:
+    """Those of evenly spaced points of the axis that are in the image."""
+    points = point_a + np.linspace(0, 1, _POINTS)[:, None] * (point_b - point_a)
+    points = points[points[:, 2] > _NEAREST_M]
+    px = points @ camera.K.T
+    px = px[:, :2] / px[:, 2:]
+    seen = (px > _BORDER_PX).all(axis=1) & (px < np.array([camera.width, camera.height]) - _BORDER_PX).all(axis=1)
+    return np.asarray(points[seen], np.float64)
 
 
 def _prior(

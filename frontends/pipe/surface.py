@@ -38,7 +38,7 @@ def occlusion_score(
         good = np.isfinite(inside) & np.isfinite(outside)
         if good.sum() < 8:
             continue
-        inside, outside = _flat(inside[good]), _flat(outside[good])
+        inside, outside = flat(inside[good]), flat(outside[good])
         inner.append(float(inside.var()))
         outer.append(float(outside.var()))
         correlation = float((inside * outside).mean() / max(np.sqrt(inner[-1] * outer[-1]), 1e-9))
@@ -70,7 +70,7 @@ def _profile(
     return values.reshape(bins, -1).mean(axis=1).astype(float)
 
 
-def _flat(values: Float) -> Float:
+def flat(values: Float) -> Float:
     """Without mean and trend along the last axis, shape (..., n)."""
     place = np.arange(values.shape[-1]) - 0.5 * (values.shape[-1] - 1)
     trend = values @ place / float(place @ place)
@@ -103,7 +103,7 @@ def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, ha
     smooth = (
         strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
     )
-    variance = _flat(smooth).var(axis=1) + 0.5
+    variance = flat(smooth).var(axis=1) + 0.5
     inside = _signed(lines, core_px, place, across)
     pipe = median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)])
     wall = median(variance[inside < -2.0]) if (inside < -2.0).any() else pipe
@@ -139,7 +139,7 @@ def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) 
     strips = sampled(patch, centre + place[:, None, None] * across + along[:, None] * axis)
     smooth = strips[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2).astype(float)
     known = np.isfinite(smooth).all(axis=1)
-    variance = np.where(known, _flat(np.where(known[:, None], smooth, 0.0)).var(axis=1), np.nan) + 0.5
+    variance = np.where(known, flat(np.where(known[:, None], smooth, 0.0)).var(axis=1), np.nan) + 0.5
     core = variance[(np.abs(place) <= 3.0) & known]
     if len(core) < 4:
         return []

@@ -1,5 +1,6 @@
 """Repeat a published experiment on rendered images, with the truth beside it."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -14,8 +15,14 @@ from ...factors.errors import SurecutError
 from ..fiducial_experiment import METHODS, Outcome, Setup, run_experiment
 from ..fiducial_plot import FORMATS, draw
 from ..fiducial_table import as_json, as_section, cells, rows, stated, told, with_section
+from ..held import HOLDS
+from ..pipe_experiment import examine_all
+from ..pipe_table import as_json as pipe_json
+from ..pipe_table import as_section as pipe_section
+from ..pipe_table import tables as pipe_tables
 
 app = typer.Typer(no_args_is_help=True)
+_COLUMNS = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
 
 
 @app.callback()
@@ -52,8 +59,7 @@ def fiducial(
         focal_sigma_rel=sigma / 100,
         seed=seed,
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True) as bar:
+    with Progress(*_COLUMNS, transient=True) as bar:
         task = bar.add_task("photographing the page", total=1.0)
         outcome = run_experiment(setup, lambda share: bar.update(task, completed=share))
     show(outcome, Console())
@@ -64,6 +70,39 @@ def fiducial(
         write_text(page, with_section(before, as_section(setup, rows(outcome.depths), told(outcome))))
     if plot is not None:
         write_bytes(plot, draw(outcome, plot.suffix))
+
+
+@app.command()
+def pipe(
+    folder: Annotated[Path, typer.Argument(help="Simulated recordings (*.mcap); they carry their truth.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write everything in figures.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Put the tables into a page (Markdown).")] = None,
+    held: Annotated[
+        bool, typer.Option("--held", help="Solve again with parts of the truth held: what stands in the way?")
+    ] = False,
+    recordings: Annotated[int | None, typer.Option(help="Only the first ones.", min=1)] = None,
+) -> None:
+    """Cut points and cylinders of simulated recordings against their truth."""
+    with Progress(*_COLUMNS, transient=True) as bar:
+        task = bar.add_task("recordings", total=min(len(list(folder.glob("*.mcap"))), recordings or sys.maxsize))
+        found = examine_all(folder, tuple(HOLDS) if held else (), recordings, lambda: bar.advance(task))
+    console = Console()
+    for title, header, lines in pipe_tables(found):
+        shown = Table(title=title, box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+        for name in header:
+            shown.add_column(name)
+        for line in lines:
+            shown.add_row(*line)
+        console.print(shown)
+    for one in found:
+        if one.reason:
+            console.print(f"{one.recording}: {one.reason}", highlight=False)
+    if json_file is not None:
+        write_text(json_file, pipe_json(found))
+    if page is not None:
+        before = page.read_text(encoding="utf-8") if page.exists() else "# Pipes\n"
+        heading = f"Simulated recordings: {len(found)} of {folder.name}"
+        write_text(page, with_section(before, pipe_section(found, heading)))
 
 
 def show(outcome: Outcome, console: Console) -> None:

@@ -1,0 +1,63 @@
+"""Total loss of view on rendered pixels: a turn that no track survives, darkness, another place; see `-m campaign`."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from surecut.estimator.optimise import optimise
+from surecut.simulation.campaign_pixels import truth_of_log
+from surecut.simulation.evaluate import motion_quantities, pose_quantity
+from surecut.simulation.recording import simulate
+from surecut.simulation.scenario import load_scenarios
+
+pytestmark = pytest.mark.campaign
+
+AWAY_S, BACK_S = 8.0, 12.5
+"""When the view is lost, and when the place of before is in view again."""
+
+
+@pytest.fixture(scope="module")
+def estimated(tmp_path_factory):
+    log = tmp_path_factory.mktemp("rendered") / "whirl.mcap"
+    (scenario,) = load_scenarios("whirl")
+    simulate(log, scenario, 5, workers=1)
+    return optimise(log), truth_of_log(log)
+
+
+def errors(result, truth, seconds):
+    """Position m and rotation deg of all frames within some seconds, in the {o} of the start."""
+    true = dict(zip(truth.stamps_ns, truth.o_T_m, strict=True))
+    start_ns = min(true)
+    off = []
+    for pose in result.trajectory:
+        if pose.stamp_ns in true and seconds[0] <= (pose.stamp_ns - start_ns) * 1e-9 <= seconds[1]:
+            difference = np.linalg.inv(true[pose.stamp_ns]) @ pose.matrix
+            off.append(
+                (np.linalg.norm(difference[:3, 3]), np.rad2deg(Rotation.from_matrix(difference[:3, :3]).magnitude()))
+            )
+    return np.array(off)
+
+
+def test_the_trajectory_goes_on_in_the_same_frame(estimated):
+    after = errors(*estimated, (BACK_S, 1e3))
+    assert len(after) > 200
+    assert after[:, 0].max() < 0.06
+    assert after[:, 1].max() < 0.8
+
+
+def test_the_points_are_found_as_if_nothing_had_happened(estimated):
+    result, truth = estimated
+    assert result.points
+    for point in result.points:
+        assert np.linalg.norm(point.position_m - truth.points_b_m[point.id]) < 0.025
+
+
+def test_what_lies_between_is_known_to_be_uncertain(estimated):
+    result, truth = estimated
+    true = dict(zip(truth.stamps_ns, truth.o_T_m, strict=True))
+    start_ns = min(true)
+    for pose in result.trajectory:
+        seconds = (pose.stamp_ns - start_ns) * 1e-9
+        if pose.covariance is not None and pose.stamp_ns in true and AWAY_S < seconds < BACK_S:
+            assert pose_quantity("trajectory", "m", pose.matrix, pose.covariance, true[pose.stamp_ns]).nees < 30.0
+    assert max(quantity.nees for quantity in motion_quantities(result.motions, truth)) < 30.0
