@@ -27,6 +27,8 @@ SNOOPED = ("depth cloud", "pipe outline", "pipe width", "picks")
 """Families of few measurements, each of which may hold a degree of freedom almost alone."""
 SNOOPING_SIGMA = 3.7
 SNOOPING_ROUNDS = 8
+CONVERGED, ON_THE_WAY = 1e-6, 1e-4
+"""Share of the error that an iteration may still gain: at the end, and while outliers are being taken out."""
 MINIMUM_VIEWS = 2
 """Pixels that a landmark needs to be a point."""
 
@@ -63,7 +65,7 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            values, more = optimum(without_factors(log, off), at.values)
+            values, more = optimum(without_factors(log, off), at.values, ON_THE_WAY)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
     at, more, slack = _with_track_weights(log, off, at, robust_sigma)
@@ -78,7 +80,8 @@ def _with_track_weights(
     """The optimum with tracks weighed by what they are worth, the iterations to there, and the weights' slack."""
     weights = track_weights(at.active, at.system, ODOMETRY)
     if not weights.by_position:
-        return at, 0, 1.0
+        values, iterations = optimum(without_factors(log, off), at.values) if off else (at.values, 0)
+        return (linearise(log, off, values, robust_sigma) if iterations else at), iterations, 1.0
     factors = {}
     for position, weight in weights.by_position.items():
         index, factor, record = at.active[position]
@@ -88,10 +91,12 @@ def _with_track_weights(
     return linearise(weighed, off, values, robust_sigma), iterations, weights.slack
 
 
-def optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> tuple[gtsam.Values, int]:
+def optimum(
+    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float = CONVERGED
+) -> tuple[gtsam.Values, int]:
     """Levenberg-Marquardt from a start near the optimum: the values, and the number of iterations."""
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-6)
+    parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(1e-4)
     parameters.setMaxIterations(40)
     parameters.setlambdaInitial(1e-5)

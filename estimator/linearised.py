@@ -28,6 +28,13 @@ class Linearised:
     inflation: float = 1.0
     """Variance of the tracks' errors over what they state, on average."""
 
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The factors, with the weights that they have here."""
+        graph = gtsam.NonlinearFactorGraph()
+        for _, factor, _ in self.active:
+            graph.add(factor)
+        return graph
+
 
 def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
     """The factors of a log, without those that are off, at an estimate."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from . import keys
 from .geometry import point_to_frame
-from .noise import Model, gaussian, robust
+from .noise import Model, robust
 
 Float = NDArray[np.float64]
 
@@ -30,9 +30,11 @@ def mobile_projection(camera: str, px: Float, model: Model, keyframe: int, point
 
 def reweighed(factor: Any, camera: str, weight: float, robust_sigma: float) -> gtsam.NonlinearFactor:
     """A factor of `mobile_projection` with `weight` times its information."""
-    pose, point = (next(k for k in factor.keys() if keys.kind(k) == kind) for kind in "xl")
-    covariance = np.linalg.inv(factor.noiseModel().noise().information()) / weight
-    return mobile_projection(camera, factor.measured(), robust(gaussian(covariance), robust_sigma), pose, point)
+    involved = factor.keys()
+    pose = next(key for key in involved if keys.kind(key) == "x")
+    point = next(key for key in involved if keys.kind(key) == "l")
+    model = gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * factor.noiseModel().noise().R())
+    return mobile_projection(camera, factor.measured(), robust(model, robust_sigma), pose, point)
 
 
 def machine_projection(px: Float, model: Model, base: int, point: int) -> gtsam.NonlinearFactor:

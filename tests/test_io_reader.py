@@ -9,7 +9,7 @@ import logmaker
 import numpy as np
 import pytest
 import zstandard
-from reader_helpers import Open, close_streams, from_file, from_pipe
+from reader_helpers import Open, from_file
 from realdata import real_data
 
 from surecut.factors.errors import LogError
@@ -24,17 +24,6 @@ from surecut.io.messages import (
     PoseBody,
 )
 from surecut.io.reader import LogReader
-
-
-@pytest.fixture(autouse=True)
-def _close_streams():
-    yield
-    close_streams()
-
-
-@pytest.fixture(params=[from_file, from_pipe])
-def open_log(request) -> Open:
-    return request.param
 
 
 @pytest.fixture(scope="module")

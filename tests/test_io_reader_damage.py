@@ -7,21 +7,10 @@ from pathlib import Path
 import logmaker
 import numpy as np
 import pytest
-from reader_helpers import Open, close_streams, from_file, from_pipe
+from reader_helpers import Open
 
 from surecut.factors.errors import LogError
 from surecut.io.reader import LogReader
-
-
-@pytest.fixture(autouse=True)
-def _close_streams():
-    yield
-    close_streams()
-
-
-@pytest.fixture(params=[from_file, from_pipe])
-def open_log(request) -> Open:
-    return request.param
 
 
 def counts(reader: LogReader) -> Counter[str]:

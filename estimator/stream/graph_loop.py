@@ -45,7 +45,8 @@ class GraphLoop:
         tell: takes each answer.
         memory: what an earlier run knew.
         checkpoint: file that is kept up to date; None for none.
-        apart: the audit and the checkpoint are made by copies of the process, so that no answer waits for them.
+        apart: somebody waits for answers: they come by the computer's clock too, and the audit and the checkpoint are
+            made by copies of the process.
     """
 
     def __init__(
@@ -74,8 +75,9 @@ class GraphLoop:
         self._audit = Audit()
         self._auditing: Aside[Audit] = Aside(apart)
         self._saving: Aside[str] = Aside(apart)
+        self._live = apart
         self._told_s = 0.0
-        """When the last answer was told, by the computer's clock."""
+        """When an answer was last due, by the computer's clock."""
         self._next_audit_ns = self._next_answer_ns = 0
         self._saved_s = time.monotonic()
         self._answer: Answer | None = None
@@ -106,8 +108,9 @@ class GraphLoop:
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
-        self._bounded.tidy()
         self._answer_when_due(sensed.stamp_ns, clicked, busy)
+        self._bounded.tidy()
+        self._answer_when_due(sensed.stamp_ns, False, busy)
 
     def _told(self) -> tuple[int, int]:
         """Changes with each factor that enters or leaves."""
@@ -160,12 +163,14 @@ class GraphLoop:
         period = self._settings.answer_period_ns
         if self._next_answer_ns - stamp_ns > 2 * period:
             self._next_answer_ns = 0  # the clock was set back
-        if stamp_ns < self._next_answer_ns and not at_once:
+        waited = time.monotonic() - self._told_s >= period / S
+        if stamp_ns < self._next_answer_ns and not at_once and not (waited and self._live):
             return
-        if busy and time.monotonic() - self._told_s < period / S:
+        if busy and not (waited or at_once):
             return  # what waits passes faster than it was measured
         self._next_answer_ns = stamp_ns + period
         self.answer(stamp_ns)
+        self._told_s = time.monotonic()
 
     def mark_changed(self) -> None:
         """The next answer is made anew."""
@@ -189,7 +194,6 @@ class GraphLoop:
             self._answer, counts=dict(self.counts), cpu_s=time.process_time(), suspects=self._knocks.suspects
         )
         self._tell(self._answer)
-        self._told_s = time.monotonic()
         return self._answer
 
     def _maybe_audit(self, stamp_ns: int) -> None:

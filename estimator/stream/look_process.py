@@ -17,13 +17,12 @@ from ...io.messages import Message, PickBody
 from ...io.pairing import StereoPair
 from ..bundle import Bundle
 from ..items import Item, unreadable
-from ..sensing import Sensed, Sensing, images
+from ..sensing import Sensed, images
 from ..sensors import PairImages
 from .glances import Glances
 from .parent import LOOK_NICE
-from .serving import serve
+from .serving import FrontEnd, serve
 from .settings import StreamSettings
-from .thinning import Thinning
 from .wire import LateClick, Tracked, Worked
 
 REFUSALS = 1000
@@ -48,12 +47,8 @@ class Recent:
     frame: StereoFrame
 
 
-class LookLoop:
-    """Looks at one group after the other.
-
-    Args:
-        calibrations: messages by topic that a fresh start has to be told again.
-    """
+class LookLoop(FrontEnd):
+    """Looks at one group after the other."""
 
     def __init__(
         self,
@@ -64,17 +59,12 @@ class LookLoop:
         out: Any,
         calibrations: Mapping[str, Message] | None = None,
     ) -> None:
-        self._sensing = Sensing(rig)
-        self._settings = settings
-        self._graph = graph
-        self._thinning = Thinning(graph, settings, patient)
-        self._out = out
+        super().__init__(rig, settings, patient, graph, out, calibrations)
         self._glances = Glances(rig, settings)
         self._recent: OrderedDict[int, Recent] = OrderedDict()
         self._newest_ns = 0
         self._pair: StereoPair | None = None
-        self.calibrations: dict[str, Message] = {}
-        for message in (calibrations or {}).values():
+        for message in [*self.calibrations.values()]:  # the graph has to know them too
             self.take(Tracked([message], None))
 
     def take(self, tracked: Tracked) -> None:
@@ -110,20 +100,20 @@ class LookLoop:
         if bundle.frame is not None:
             frame = self._thinning.offered(bundle.frame, dear=bool(bundle.picks))
             if frame is not None:
-                self._graph.put(replace(sensed, bundle=replace(bundle, frame=frame)))
+                self._onward.put(replace(sensed, bundle=replace(bundle, frame=frame)))
                 self._glance(bundle.frame)
                 return
             elif sensed.depth is not None or sensed.cameras:
                 sensed = Sensed(Bundle(sensed.stamp_ns), sensed.depth, cameras=sensed.cameras)
             else:
                 return
-        self._graph.put(sensed)
+        self._onward.put(sensed)
 
     def _glance(self, frame: StereoFrame) -> None:
         """Looks at the boards now and then while there are no keyframes."""
         recent = self._recent.get(frame.stamp_ns)
         if recent is not None and self._glances.due(frame):
-            self._graph.put(self._glances.look(frame, self._sensing.sensors.cameras["m_left"], recent.pair.left))
+            self._onward.put(self._glances.look(frame, self._sensing.sensors.cameras["m_left"], recent.pair.left))
 
     def _note(self, items: list[Item]) -> None:
         for item in items:
@@ -145,10 +135,10 @@ class LookLoop:
         stamp_ns = clicks[0].stamp_ns if clicks[0].stamp_ns > 0 else self._newest_ns
         recent = self._recent.get(self._nearest(stamp_ns))
         if recent is None:
-            self._graph.put(self._sensing.process(list(clicks)))
+            self._onward.put(self._sensing.process(list(clicks)))
             return
         own = [replace(click, stamp_ns=recent.frame.stamp_ns) for click in clicks]
-        self._graph.put(LateClick(self._sensing.look_back(own, recent.pair, recent.frame)))
+        self._onward.put(LateClick(self._sensing.look_back(own, recent.pair, recent.frame)))
 
     def _nearest(self, stamp_ns: int) -> int:
         """Stamp of the remembered frame within a millisecond."""

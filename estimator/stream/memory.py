@@ -20,12 +20,12 @@ from ...factors.camera import CameraModel
 from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
 from ...io.reader import LogReader
-from ..batch import BatchSolution, without_factors
+from ..batch import BatchSolution
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
 from ..output_files import write_text
-from ..pipe_parts import known_cylinder, known_point
+from ..pipes import known_cylinder, known_point
 from .remembered import KEY, to_data
 from .variables import LONG_LIVED, long_lived
 from .wire import Answer
@@ -72,8 +72,7 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     if solution is None:
         prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
     else:
-        graph = without_factors(engine.solver.log, set(solution.outliers))
-        prior = gaussian_of(graph, solution.values, long_lived(solution.values))
+        prior = gaussian_of(solution.at.graph(), solution.values, long_lived(solution.values))
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),

@@ -1,27 +1,51 @@
 """The life of a front end's process: what comes is taken, and orders are handed on."""
 
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 
+from ...factors.rig import Rig
 from ...io.messages import Message
+from ..sensing import Sensing
 from .parent import end_with_parent, give_way, keep_loaded
+from .settings import StreamSettings
+from .thinning import Thinning
 from .wire import Died, Order, Ready
 
 
-class FrontEnd(Protocol):
-    """What does the work."""
+class FrontEnd(ABC):
+    """What does the work.
 
-    @property
-    def calibrations(self) -> Mapping[str, Message]:
-        """Messages by topic that a fresh start has to be told again."""
-        ...
+    Args:
+        patient: nothing may be left out, however long it takes.
+        onward: queue of the next process.
+        out: line to the parent.
+        calibrations: messages by topic that a fresh start has to be told again.
+    """
 
+    def __init__(
+        self,
+        rig: Rig,
+        settings: StreamSettings,
+        patient: bool,
+        onward: Any,
+        out: Any,
+        calibrations: Mapping[str, Message] | None = None,
+    ) -> None:
+        self._settings = settings
+        self._sensing = Sensing(rig)
+        self._thinning = Thinning(onward, settings, patient)
+        self._onward = onward
+        self._out = out
+        self.calibrations = dict(calibrations or {})
+        self._sensing.calibrate([*self.calibrations.values()])
+
+    @abstractmethod
     def take(self, item: Any, /) -> None:
         """One item of the queue; whatever is wrong with it is told."""
-        ...
 
 
 def serve(

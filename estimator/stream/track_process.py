@@ -1,7 +1,6 @@
 """The tracking's process: it does nothing that a pose has to wait for but the pose."""
 
 import time
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,13 +8,11 @@ from numpy.typing import NDArray
 
 from ...factors.errors import SurecutError
 from ...factors.rig import Rig
-from ...io.messages import CloudBody, DepthBody, ImageBody, Message
+from ...io.messages import CloudBody, DepthBody, ImageBody
 from ...io.pairing import StereoPair
 from ..items import Item, unreadable
-from ..sensing import Sensing
-from .serving import serve
+from .serving import FrontEnd, serve
 from .settings import StreamSettings
-from .thinning import Thinning
 from .wire import Frame, Group, Tracked, Worked
 
 Float = NDArray[np.float64]
@@ -30,28 +27,8 @@ def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: A
     serve("tracking", 0, lambda known: TrackLoop(rig, settings, patient, look, out, known), inbox, look, out)
 
 
-class TrackLoop:
-    """Follows the mobile camera; hands everything on.
-
-    Args:
-        calibrations: messages by topic that a fresh start has to be told again.
-    """
-
-    def __init__(
-        self,
-        rig: Rig,
-        settings: StreamSettings,
-        patient: bool,
-        look: Any,
-        out: Any,
-        calibrations: Mapping[str, Message] | None = None,
-    ) -> None:
-        self._sensing = Sensing(rig)
-        self._thinning = Thinning(look, settings, patient)
-        self._look = look
-        self._out = out
-        self.calibrations = dict(calibrations or {})
-        self._sensing.calibrate([*self.calibrations.values()])
+class TrackLoop(FrontEnd):
+    """Follows the mobile camera; hands everything on."""
 
     def take(self, group: Group) -> None:
         """A pair that cannot be used is told, and the stream goes on."""
@@ -94,7 +71,7 @@ class TrackLoop:
         elif self._thinning.behind() and all(_surfaces_only(item) for item in tracked.items):
             self._out.put(Worked({}, 0, None, 0, 0.0, left_out=len(tracked.items)))
             return
-        self._look.put(Tracked(tracked.items, frame))
+        self._onward.put(Tracked(tracked.items, frame))
 
 
 def _surfaces_only(item: Item) -> bool:
