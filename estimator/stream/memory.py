@@ -25,7 +25,7 @@ from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
 from ..output_files import write_text
-from ..pipes import known_cylinder, known_point
+from ..pipe_parts import known_cylinder, known_point
 from .remembered import KEY, to_data
 from .variables import LONG_LIVED, long_lived
 from .wire import Answer
