@@ -26,6 +26,7 @@ from .calibration import departures, held, hold
 from .glances import Glance
 from .knocks import Knocks
 from .memory import Memory, recall, remember, save
+from .parent import give_back
 from .posterior import Posterior, posterior_of
 from .settings import S, StreamSettings
 from .trust import grown
@@ -109,7 +110,8 @@ class GraphLoop:
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
         self._answer_when_due(sensed.stamp_ns, clicked, busy)
-        self._bounded.tidy()
+        if self._bounded.tidy():
+            give_back()
         self._answer_when_due(sensed.stamp_ns, False, busy)
 
     def _told(self) -> tuple[int, int]:

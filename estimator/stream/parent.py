@@ -1,5 +1,6 @@
 """What the processes of a stream do for each other: they end with their parent, and let others go first."""
 
+import ctypes
 import gc
 import multiprocessing
 import os
@@ -29,6 +30,15 @@ def keep_loaded() -> None:
     a tenth of a second."""
     gc.collect()
     gc.freeze()
+
+
+def give_back() -> None:
+    """Call after a large piece of work: memory that is free goes back to the system, where the C library can do that
+    (glibc), so that what is resident is what is used."""
+    try:
+        ctypes.CDLL(None).malloc_trim(0)
+    except (AttributeError, OSError, TypeError):  # another C library
+        return
 
 
 def give_way(niceness: int) -> None:
