@@ -65,8 +65,10 @@ def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> L
         slack: what else the standard deviations of their errors grow by.
     """
     found = correlate(at.active, at.values, at.system, family)
-    if found is None:
+    if found is None and slack == 1.0:
         return at
     mine = np.repeat([record.family == family for _, _, record in at.active], at.system.rows)
-    at.system.root = csr_matrix(diags(np.where(mine, slack, 1.0)) @ found.root)
-    return Linearised(at.values, at.active, at.system, at.norms, found.inflation * slack**2)
+    own = csr_matrix(diags(np.where(mine, slack, 1.0)))
+    at.system.root = own if found is None else csr_matrix(own @ found.root)
+    inflation = 1.0 if found is None else found.inflation
+    return Linearised(at.values, at.active, at.system, at.norms, inflation * slack**2)

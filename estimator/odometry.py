@@ -35,8 +35,11 @@ class OdometrySettings:
     minimum_shared: int = 12
     """Fewer landmarks shared with the map: a motion prior joins the keyframe to the last one."""
     lost_speed_m_s: float = 0.5
-    lost_turn_rad_s: float = 1.0
-    """Standard deviation of a hand-held camera's velocity about its last one, while nothing is tracked."""
+    lost_turn_rad_s: float = 6.0
+    """Standard deviation of a hand-held camera's velocity about its last one, while nothing is tracked: it may be its
+    turn that no track survives. A wrist turns by 10 rad/s at most."""
+    poor_turn_rad_s: float = 1.0
+    """The same while the tracks hold, but hardly a landmark is among them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,14 +223,9 @@ class Odometry:
             seconds = min(seconds, (frame.stamp_ns - self._held_ns) * 1e-9 + POOR_S)
             self.gap_s = seconds if few else 0.0
         motion = self._state.pose(earlier).between(pose)
-        factor = motion_prior(
-            earlier,
-            keys.keyframe(index),
-            motion,
-            abs(seconds),
-            self._settings.lost_speed_m_s,
-            self._settings.lost_turn_rad_s,
-        )
+        settings = self._settings
+        turn_rad_s = settings.lost_turn_rad_s if self._since_keyframe_lost else settings.poor_turn_rad_s
+        factor = motion_prior(earlier, keys.keyframe(index), motion, abs(seconds), settings.lost_speed_m_s, turn_rad_s)
         what = f"motion over {seconds:.2f} s without enough shared landmarks"
         update.add(factor, Record(FAMILY, "motion prior", frame.stamp_ns, what, rejectable=False))
 

@@ -66,6 +66,8 @@ class OutlineSearch:
         """Stamps of views too near to one of these."""
         self._apart: dict[str, dict[int, Float]] = {}
         """Where the camera stood in views that differ, of all that show the pipe, by pipe and camera, and stamp."""
+        self._alike: dict[str, set[int]] = {}
+        """Stamps of views too near to one of these, or without the pipe."""
 
     def see(self, pair: PairImages, picks: Sequence[Pick]) -> None:
         """A keyframe's pictures, and the clicks in them."""
@@ -124,6 +126,8 @@ class OutlineSearch:
             self._widths.enter(pipe)
 
     def _measure_width(self, pipe: str, ends: tuple[Float, Float], anew: bool) -> None:
+        if anew:
+            self._alike.clear()
         views = [KeptView(pair, camera) for camera in MOBILE for pair in self._differing(pipe, camera, ends)]
         if self._widths.measure(pipe, ends, views, anew):
             # What was found without knowing the width is looked for again.
@@ -137,16 +141,19 @@ class OutlineSearch:
     def _differing(self, pipe: str, camera: str, ends: tuple[Float, Float]) -> list[PairImages]:
         """Kept pictures that show a part of a pipe, each from somewhere else."""
         apart = self._apart.setdefault(f"{pipe} {camera}", {})
+        alike = self._alike.setdefault(f"{pipe} {camera}", set())
         model = self._engine.cameras[camera]
-        for pair in self._kept:
+        for pair in [kept for kept in self._kept if kept.stamp_ns not in apart and kept.stamp_ns not in alike]:
             if len(apart) >= OUTLINE_VIEWS:
                 break
             where = self._engine.seen_from(camera, pair.stamp_ns)
-            if where is None or pair.stamp_ns in apart:
+            if where is None:
                 continue
             place = where.o_T_c.translation()
             if not _near(place, apart) and part_in_sight(model, *(where.o_T_c.transformTo(end) for end in ends)):
                 apart[pair.stamp_ns] = place
+            else:
+                alike.add(pair.stamp_ns)
         return [pair for pair in self._kept if pair.stamp_ns in apart]
 
     def _about(self, pick: Pick, pair: PairImages) -> None:

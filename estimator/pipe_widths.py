@@ -52,18 +52,28 @@ class PipeWidths:
             anew: measure with the same views too: the axis is known better.
 
         Returns:
-            True where it has become known just now: edges that were found without it want another look.
+            True where it has become known just now, or is another one than before: edges that were found without it
+            want another look.
         """
         before = self._views.get(pipe, 0)
         if len(kept) < max(FEWEST_VIEWS, 0.0 if anew else MORE_VIEWS * before):
             return False
         self._views[pipe] = len(kept)
         found = width_by_texture([view for one in kept if (view := self._view(one, ends)) is not None])
-        if found is None:
+        if found is None or self._narrower_than_edges(pipe, found):
             return False
-        first = pipe not in self._found
+        known = self._found.get(pipe)
         self._found[pipe] = found
-        return first
+        return known is None or abs(found.radius_m - known.radius_m) > np.hypot(found.sigma_m, known.sigma_m)
+
+    def _narrower_than_edges(self, pipe: str, found: TextureWidth) -> bool:
+        """Do edges that several views agree on lie outside a width? Then something on the pipe is restless, such as a
+        label or a shadow: edges of something else would have to move with the pipe from view to view."""
+        engine = self._engine
+        axis = engine.pipes.axis(pipe)
+        if axis is None or engine.pipes.cylinders[pipe].outlines < FEWEST_VIEWS:
+            return False
+        return axis[2] - found.radius_m > WIDER_SIGMA * found.sigma_m
 
     def _view(self, kept: KeptView, ends: tuple[Float, Float]) -> PipeView | None:
         where = self._engine.seen_from(kept.camera, kept.pair.stamp_ns)

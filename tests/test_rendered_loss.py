@@ -1,4 +1,4 @@
-"""Total loss of view on rendered pixels: a turn that no track survives, darkness, another place; see `-m campaign`."""
+"""Total loss of view on rendered pixels: a turn that no track survives, then darkness; see `-m campaign`."""
 
 import numpy as np
 import pytest
@@ -8,19 +8,20 @@ from surecut.estimator.optimise import optimise
 from surecut.simulation.campaign_pixels import truth_of_log
 from surecut.simulation.evaluate import motion_quantities, pose_quantity
 from surecut.simulation.recording import simulate
-from surecut.simulation.scenario import load_scenarios
+from surecut.simulation.scenario import load_scenarios, override
 
 pytestmark = pytest.mark.campaign
 
-AWAY_S, BACK_S = 8.0, 12.5
+AWAY_S, BACK_S = 8.0, 11.5
 """When the view is lost, and when the place of before is in view again."""
+SMALLER = {"mobile": {"rate_hz": 10}, "kinect": {"rate_hz": 1, "width": 320, "height": 240, "depth_focal_px": 292.5}}
 
 
 @pytest.fixture(scope="module")
 def estimated(tmp_path_factory):
     log = tmp_path_factory.mktemp("rendered") / "whirl.mcap"
     (scenario,) = load_scenarios("whirl")
-    simulate(log, scenario, 5, workers=1)
+    simulate(log, override(scenario, SMALLER), 5, workers=1)
     return optimise(log), truth_of_log(log)
 
 
@@ -40,7 +41,7 @@ def errors(result, truth, seconds):
 
 def test_the_trajectory_goes_on_in_the_same_frame(estimated):
     after = errors(*estimated, (BACK_S, 1e3))
-    assert len(after) > 200
+    assert len(after) > 150
     assert after[:, 0].max() < 0.06
     assert after[:, 1].max() < 0.8
 

@@ -9,6 +9,8 @@ from surecut.simulation.measurement_level import draw
 from surecut.simulation.measurement_level_scenario import Scenario
 
 SEEDS = range(12)
+PAIR = ("m_left_T_m_right.tx", "m_left_T_m_right.ry")
+"""Baseline and vergence."""
 
 
 def scenario(name):
@@ -37,7 +39,7 @@ def test_points_are_within_1_2_times_those_of_a_perfect_pair_and_the_pair_is_fou
         found = [quantity for row in rows for quantity in row["quantities"]]
         errors[name] = [q["error"] for q in found if q["group"] == "point"]
         if name == "rig-off":
-            inside = [q["probability"] < 0.95 for q in found if q["name"] in ("baseline", "m_left_T_m_right.ry")]
+            inside = [q["probability"] < 0.95 for q in found if q["name"] in PAIR]
     assert np.mean(errors["rig-off"]) < 1.2 * np.mean(errors["rig-true"])
     # 24 intervals: fewer than 20 by chance in one of 200 cases.
     assert len(inside) == 2 * len(SEEDS)
