@@ -50,6 +50,8 @@ class Life:
     began: float
     back_s: float = float("nan")
     off_sigma: float = 0.0
+    oldest_ns: int = 0
+    """Stamp of the first line, which may tell what is remembered: of that nothing is recorded again."""
     newest_ns: int = 0
     wrong_sigma: float = 0.0
     go: int = 0
@@ -100,6 +102,7 @@ def lived(port: int, memory: Path, truth: dict[str, np.ndarray], until_s: float,
     stop = None
     for update in lines(port, 120.0):
         points = points_of(update)
+        life.oldest_ns = life.oldest_ns or update["stamp_ns"]
         life.newest_ns = max(life.newest_ns, update["stamp_ns"])
         life.wrong_sigma = max(life.wrong_sigma, farthest(update, truth))
         life.go += update["verdict"].startswith("GO") and stop is None and bool(before)
@@ -129,7 +132,7 @@ def kills(log: Path, number: int, seed: int) -> list[Kill]:
             before = life.points
             if not i:
                 continue
-            lost_s = max(life.newest_ns - recorded_until_ns(record), 0) * 1e-9
+            lost_s = max(life.newest_ns - max(recorded_until_ns(record), life.oldest_ns), 0) * 1e-9
             found.append(Kill(life.back_s, life.off_sigma, lost_s, life.wrong_sigma, life.go))
             print(
                 f"{i:3d}: back after {life.back_s:.1f} s, {life.off_sigma:.2f} sigma off, {lost_s:.2f} s lost, "

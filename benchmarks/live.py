@@ -194,7 +194,7 @@ def follow(port: int, seen: Seen, stop: threading.Event) -> None:
 
 def stalled_viewer(port: int, stop: threading.Event) -> None:
     """Subscribes to everything and reads nothing more."""
-    with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_queue=1) as viewer:  # type: ignore[list-item]
+    with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_queue=1, ping_interval=None) as viewer:  # type: ignore[list-item]
         time.sleep(5.0)
         wanted = [{"id": n, "channelId": n} for n in range(1, 20)]
         viewer.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))

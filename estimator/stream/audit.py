@@ -8,11 +8,13 @@ import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
+from ..batch import without_factors
 from ..consistency import family_tests, judge, prior_tests
 from ..engine import Engine
+from ..graph import FactorLog
 from ..linearised import linearise, with_correlated_tracks
 from ..marginal import FAMILY
-from ..observability import determined
+from ..observability import Undetermined, determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
 from ..result import Consistency
@@ -30,19 +32,34 @@ class Audit:
     """By point: factor on its covariance, at least 1."""
 
 
-def relinearised(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, set[int]]:
     """One Newton step on: residuals at an old linearisation are not the data's. The running estimate stays as it is,
-    so that looking does not change what comes after."""
-    with determined():
-        return values.retract(graph.linearize(values).optimize())
+    so that looking does not change what comes after.
+
+    Returns:
+        The values, and the places of factors that do not count: those of landmarks that nothing determines there.
+
+    Raises:
+        ObservabilityError: something else than a landmark is not determined.
+    """
+    off: set[int] = set()
+    while True:
+        try:
+            with determined():
+                return values.retract(without_factors(log, off).linearize(values).optimize()), off
+        except Undetermined as error:
+            views = {i for i, f, r in log.active() if error.key in f.keys() and r.family != FAMILY}
+            if keys.kind(error.key) != "l" or views <= off:
+                raise
+            off |= views
 
 
 def audit(engine: Engine) -> Audit:
     """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
     mostly made of them, and cannot be told apart any more."""
     log = engine.solver.log
-    values = relinearised(log.graph(), engine.solver.values())
-    at = with_correlated_tracks(linearise(log, (), values, engine.rig.gates.robust_sigma), ODOMETRY)
+    values, off = relinearised(log, engine.solver.values())
+    at = with_correlated_tracks(linearise(log, off, values, engine.rig.gates.robust_sigma), ODOMETRY)
     system = at.system
     if system.root is not None:
         earlier = np.array([record.family == FAMILY for _, _, record in at.active])

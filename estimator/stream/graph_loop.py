@@ -81,6 +81,8 @@ class GraphLoop:
         """When an answer was last due, by the computer's clock."""
         self._next_audit_ns = self._next_answer_ns = 0
         self._saved_s = time.monotonic()
+        self._kept_points: frozenset[str] = frozenset()
+        """Ids of points in the checkpoint."""
         self._answer: Answer | None = None
         self._changed = memory is not None
         self._first_ns: int | None = None
@@ -341,10 +343,13 @@ class GraphLoop:
     def checkpoint_when_due(self) -> None:
         """Writes the file every few seconds; a full disk is counted, not fatal."""
         now = time.monotonic()
-        due = self._checkpoint is not None and now - self._saved_s >= self._settings.checkpoint_period_s
+        points = frozenset(point.id for point in self._answer.points) if self._answer is not None else frozenset()
+        # a new point is kept at once: a death a second later must not cost the operator's clicks
+        waited = now - self._saved_s >= self._settings.checkpoint_period_s or points != self._kept_points
+        due = self._checkpoint is not None and waited
         try:
             if due and not self._saving.busy() and not self.engine.graph.unsolved:
-                self._saved_s = now
+                self._saved_s, self._kept_points = now, points
                 self._saving.begin(self._written)
             if self._saving.taken() is not None:
                 self.counts["checkpoints"] += 1
