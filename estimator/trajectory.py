@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.geometry import pose3, ros_covariance
-from .odometry import FramePose, Odometry
+from .odometry import FramePose, Odometry, SeenTracks
 from .resection import Map, resected
 from .result import PoseEstimate
 
@@ -26,7 +26,7 @@ def trajectory(odometry: Odometry, values: gtsam.Values, covariances: list[Float
     seen = [f.tracks.ids for f in odometry.frames if f.tracks is not None]
     known = Map.of(values, np.concatenate(seen) if seen else np.zeros(0, np.int64))
     frames = sorted(odometry.frames, key=lambda f: f.stamp_ns)
-    placed = _bridged([f.stamp_ns for f in frames], [_placed(f, odometry, values, known) for f in frames])
+    placed = _bridged([f.stamp_ns for f in frames], _placed(frames, odometry, values, known))
     poses = []
     for frame, pose in zip(frames, placed, strict=True):
         own = odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns
@@ -35,16 +35,25 @@ def trajectory(odometry: Odometry, values: gtsam.Values, covariances: list[Float
     return tuple(poses)
 
 
-def _placed(frame: FramePose, odometry: Odometry, values: gtsam.Values, known: Map) -> gtsam.Pose3 | None:
-    """A keyframe by the graph, any other by its tracks in the map; None where it has seen nothing."""
-    o_T_k = values.atPose3(keys.keyframe(frame.keyframe))
-    if odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns:
-        return o_T_k
-    if frame.tracks is None:
-        return None
-    guess = o_T_k.compose(pose3(frame.keyframe_T_this))
-    found = resected(guess, frame.tracks, known)
-    return guess if found is None else found
+def _placed(frames: list[FramePose], odometry: Odometry, values: gtsam.Values, known: Map) -> list[gtsam.Pose3 | None]:
+    """Keyframes by the graph, any other frame by its tracks in the map; None where it has seen nothing."""
+    poses: list[gtsam.Pose3 | None] = []
+    between: dict[int, SeenTracks] = {}
+    for i, frame in enumerate(frames):
+        pose = values.atPose3(keys.keyframe(frame.keyframe))
+        if odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns:
+            poses.append(pose)
+        elif frame.tracks is None:
+            poses.append(None)
+        else:
+            poses.append(pose.compose(pose3(frame.keyframe_T_this)))
+            between[i] = frame.tracks
+    guesses = [pose.matrix() for i in between if (pose := poses[i]) is not None]
+    found, held = resected(np.array(guesses).reshape(-1, 4, 4), list(between.values()), known)
+    for i, pose, sure in zip(between, found, held, strict=True):
+        if sure:
+            poses[i] = gtsam.Pose3(gtsam.Rot3(pose[:3, :3]), pose[:3, 3])
+    return poses
 
 
 def _bridged(stamps_ns: list[int], poses: list[gtsam.Pose3 | None]) -> list[gtsam.Pose3]:

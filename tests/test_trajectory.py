@@ -36,18 +36,22 @@ def test_resection_finds_the_pose_that_made_the_pixels_and_leaves_out_strays() -
     tracks = seen_from(values, calibration, POSE)
     tracks.left_px[:9] += 25.0
     guess = POSE.retract(np.array([0.01, -0.02, 0.01, 0.02, 0.02, -0.03]))
-    found = resected(guess, tracks, Map.of(values, tracks.ids))
-    assert found is not None
-    assert np.abs(gtsam.Pose3.Logmap(POSE.between(found))).max() < 1e-4
+    found, held = resected(np.array([guess.matrix(), POSE.matrix()]), [tracks, tracks], Map.of(values, tracks.ids))
+    assert held.all()
+    for pose in found:
+        assert np.abs(gtsam.Pose3.Logmap(POSE.between(gtsam.Pose3(pose)))).max() < 1e-4
 
 
 def test_too_few_landmarks_hold_nothing() -> None:
     values, calibration = scene(np.random.default_rng(2))
     tracks = seen_from(values, calibration, POSE)
     few = SeenTracks(tracks.ids[:8], tracks.left_px[:8])
-    assert resected(POSE, few, Map.of(values, tracks.ids)) is None
     unknown = SeenTracks(tracks.ids + 1000, tracks.left_px)
-    assert resected(POSE, unknown, Map.of(values, unknown.ids)) is None
+    guesses = np.tile(gtsam.Pose3().matrix(), (3, 1, 1))
+    found, held = resected(guesses, [few, unknown, tracks], Map.of(values, np.r_[tracks.ids, unknown.ids]))
+    assert held.tolist() == [False, False, True]
+    assert (found[:2] == guesses[:2]).all()
+    assert not resected(guesses[:2], [unknown, unknown], Map.of(values, unknown.ids))[1].any()
 
 
 def test_frames_lie_on_the_map_and_blind_ones_between_their_neighbours() -> None:
