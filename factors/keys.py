@@ -104,8 +104,8 @@ DEPTH_RAYS: int = gtsam.symbol("g", 0)
 
 
 def kind(key: int) -> str:
-    """The letter of a key."""
-    return chr(gtsam.Symbol(key).chr())
+    """The letter of a key: its highest byte. Asked for all factors' keys, for which GTSAM's own Symbol is slow."""
+    return chr(key >> 56)
 
 
 def index(key: int) -> int:
