@@ -155,7 +155,7 @@ def _depth(step_m: float) -> Change:
 
 
 def _each(change_one: Callable[[object], object]) -> Change:
-    return lambda run: replace(run, measurements=tuple(change_one(m) for m in run.measurements))  # pyright: ignore[reportArgumentType]
+    return lambda run: replace(run, measurements=tuple(change_one(m) for m in run.measurements))
 
 
 def _with_rig(run: Run, **update: object) -> Run:
