@@ -15,7 +15,7 @@ from .result import Result
 from .summary import Summary
 from .surfaces import Associator
 
-SETTLE_ROUNDS = 3
+SETTLE_ROUNDS = 8
 
 
 def solved(engine: Engine) -> BatchSolution:
