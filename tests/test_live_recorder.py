@@ -63,10 +63,21 @@ number = 0
 while True:
     recorder.publish(update(number))
     recorder.image(live_image(number))
-    print(number, time.time(), flush=True)
+    sys.stdout.write(f"{number} {time.time()}\n")  # one piece, whatever the buffering
+    sys.stdout.flush()
     number += 1
     time.sleep(0.02)
 """
+
+
+def killed_after(process: subprocess.Popen[str], seconds: float) -> str:
+    """What the process had printed."""
+    time.sleep(seconds)
+    process.kill()
+    process.wait(10)
+    assert process.stdout is not None
+    with process.stdout:
+        return process.stdout.read()
 
 
 def test_after_kill_9_all_but_the_last_second_is_there(tmp_path: Path):
@@ -78,17 +89,20 @@ def test_after_kill_9_all_but_the_last_second_is_there(tmp_path: Path):
         subprocess.Popen([sys.executable, "-c", WRITER, str(path), folder], stdout=subprocess.PIPE, text=True)
         for path in paths
     ]
-    for process in processes:
-        assert process.stdout is not None
-        process.stdout.readline()  # it writes
-    time.sleep(1.5)
-    for process, path in zip(processes, paths, strict=True):
-        time.sleep(chance.uniform(0.1, 0.7))
-        process.kill()
-        process.wait(10)
-        assert process.stdout is not None
-        written = [line.split() for line in process.stdout.read().splitlines()]
-        process.stdout.close()
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            process.stdout.readline()  # it writes
+        time.sleep(1.5)
+        said = [killed_after(process, chance.uniform(0.1, 0.7)) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait(10)
+            if process.stdout is not None:
+                process.stdout.close()
+    for text, path in zip(said, paths, strict=True):
+        written = [line.split() for line in text.splitlines()]
         killed_at = float(written[-1][1])
         reader = LogReader(path)
         stamps = {m.stamp_ns for m in reader if m.topic == "/estimate/points"}

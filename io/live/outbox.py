@@ -76,12 +76,14 @@ class Outbox:
             self._queue.put(image, image.topic, image.pixels.nbytes)
 
     def stop(self) -> None:
-        """Send what is queued for at most a second."""
+        """Send what is queued for at most a second; what is left then counts as dropped."""
         self._queue.close()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_STOP_S)
             self._stopping.set()
             self._thread.join(_STOP_S)
+        while self._queue.get(0.0) is not None:
+            self._tally.add("dropped")
 
     def dropped(self) -> int:
         """Updates and images that did not fit."""

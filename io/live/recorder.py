@@ -24,7 +24,8 @@ class Recorder(ThroughOutbox):
 
     When the disk is full (or the file cannot be written for another reason) the part that was written stays readable,
     what comes then is counted as dropped, and a new part (`NAME-1.mcap`, ...) is begun once writing works again. A new
-    part is begun too where the file exists already: nothing is ever overwritten.
+    part is begun too where the file exists already: nothing is ever overwritten. Only what is on the disk counts as
+    sent; what is lost with a chunk that could not be closed counts as dropped.
 
     A part is also ended after `part_s`: what a writer has to remember of a file grows with the file.
 
@@ -65,6 +66,8 @@ class Recorder(ThroughOutbox):
         self._sink: McapSink | None = None
         self._sound = 0
         """Bytes of the file that are on the disk and end with a whole chunk."""
+        self._unsound = 0
+        """Updates and images that were written after them."""
         self._retry_s = 0.0
         self._status = "not started"
         self._closing = threading.Lock()
@@ -104,11 +107,10 @@ class Recorder(ThroughOutbox):
                 self._tally.add("dropped")
                 return
             try:
+                self._unsound += 1
                 self._append(entries, item.stamp_ns)
-                self._tally.add("sent")
             except (OSError, LogError) as error:
                 self._give_up(error)
-                self._tally.add("dropped")
 
     def _append(self, entries: list[Entry], stamp_ns: int) -> None:
         assert self._sink is not None
@@ -123,6 +125,7 @@ class Recorder(ThroughOutbox):
                 self._sink.flush()
                 os.fsync(self._file.fileno())
                 self._sound = self._file.tell()
+                self._settle("sent")
                 if time.monotonic() - self._begun_s > self._part_s:
                     self._finish()
             except (OSError, LogError) as error:
@@ -138,11 +141,19 @@ class Recorder(ThroughOutbox):
             sink.close()
             os.fsync(file.fileno())
             self._status = "finished"
+            self._settle("sent")
         except (OSError, LogError) as error:
             self._status = str(error)
             self._tally.add("errors")
+            self._settle("dropped")
         finally:
             _close(file)
+
+    def _settle(self, fate: str) -> None:
+        """Count what was written since the file was last whole."""
+        if self._unsound:
+            self._tally.add(fate, number=self._unsound)
+        self._unsound = 0
 
     def _ready(self) -> bool:
         """Whether there is a file to write to; begins a new part when it is time to try."""
@@ -187,6 +198,7 @@ class Recorder(ThroughOutbox):
         """Leave the part as it was when it was last whole."""
         self._status = str(error)
         self._tally.add("errors")
+        self._settle("dropped")
         file, self._sink, self._file = self._file, None, None
         self._retry_s = time.monotonic() + _RETRY_S
         if file is not None:
