@@ -13,12 +13,15 @@ from ..estimator.items import wanted_topics
 from ..estimator.optimise import optimise, rig_of
 from ..estimator.stopwatch import Stopwatch
 from ..factors.errors import LogError, SurecutError
+from ..factors.rig import dump_rig
 from ..io.messages import PointsBody, PoseBody
 from ..io.reader import LogReader
 from .campaign_row import Row, failed_row, row_of
 from .evaluate import evaluate
+from .faults import pose_section
 from .measurement_level_truth import TrueCamera, TruePipe, TrueRig, Truth
 from .recording import simulate
+from .rigid import rigid
 from .scenario import Scenario
 
 POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
@@ -27,20 +30,23 @@ LOG = "log"
 """Key of a scenario that is a recording already: its path."""
 
 
-def run_pixels(number: int, scenario: Mapping[str, Any], recordings: Path | None = None) -> Row:
+def run_pixels(
+    number: int, scenario: Mapping[str, Any], recordings: Path | None = None, mounts_anew: bool = False
+) -> Row:
     """Renders with the run's number as seed, or takes a recording that is there.
 
     Args:
         recordings: folder that keeps the recordings; one that is there already is not rendered again.
             Without it they are gone afterwards.
+        mounts_anew: the rig states another mount than when it was rendered, drawn with the run's number as seed.
     """
     if LOG in scenario:
-        return row_of_log(number, str(scenario["name"]), Path(scenario[LOG]))
+        return row_of_log(number, str(scenario["name"]), Path(scenario[LOG]), mounts_anew)
     wanted = Scenario.model_validate(dict(scenario))
     if recordings is None:
         with TemporaryDirectory(prefix="surecut-campaign-") as folder:
-            return row_of_log(number, wanted.name, rendered(Path(folder), number, wanted))
-    return row_of_log(number, wanted.name, rendered(recordings, number, wanted))
+            return row_of_log(number, wanted.name, rendered(Path(folder), number, wanted), mounts_anew)
+    return row_of_log(number, wanted.name, rendered(recordings, number, wanted), mounts_anew)
 
 
 def rendered(folder: Path, number: int, scenario: Scenario) -> Path:
@@ -51,19 +57,40 @@ def rendered(folder: Path, number: int, scenario: Scenario) -> Path:
     return log
 
 
-def row_of_log(number: int, name: str, log: Path) -> Row:
-    """Estimate of a simulated log and its errors."""
-    watch = Stopwatch()
+def row_of_log(number: int, name: str, log: Path, mount_anew: bool = False) -> Row:
+    """Estimate of a simulated log and its errors.
+
+    Args:
+        number: seed of what is drawn.
+        name: of the scenario.
+        log: carries its rig and its truth.
+        mount_anew: the rig gets another mount.
+    """
+    watch, truth = Stopwatch(), truth_of_log(log)
     try:
-        with watch("estimate"):
-            result = optimise(log)
+        with watch("estimate"), TemporaryDirectory(prefix="surecut-rig-") as folder:
+            result = optimise(log, _with_mount_anew(log, truth, number, Path(folder)) if mount_anew else None)
     except SurecutError as error:
         return failed_row(number, name, str(error))
-    truth = truth_of_log(log)
     row = row_of(number, name, result, evaluate(result, truth))
     row["seconds"] = watch.seconds["estimate"]
     row["chain"] = chain_errors_of_log(log, truth)
     return row
+
+
+def _with_mount_anew(log: Path, truth: Truth, seed: int, folder: Path) -> Path:
+    """The log's rig with a mount that somebody else might have measured, of the tolerance that the rig states."""
+    with LogReader(log, ()) as reader:
+        rig = rig_of(reader, None)
+    if rig.mount is None:
+        raise SurecutError(f"{log}: its rig has no mount that could be drawn anew")
+    rng = np.random.default_rng(seed)
+    f_T_b = truth.rig.f_T_b @ rigid(rng.normal(0, rig.mount.rotation_sigma_rad, 3))
+    f_T_b[:3, 3] += rng.normal(0, rig.mount.translation_sigma_m, 3)
+    path = folder / "rig.yaml"
+    mount = rig.mount.model_copy(update={"f_T_b": pose_section(f_T_b)})
+    path.write_text(dump_rig(rig.model_copy(update={"mount": mount})))
+    return path
 
 
 def chain_errors_of_log(log: Path, truth: Truth) -> list[float]:
