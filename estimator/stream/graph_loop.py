@@ -146,7 +146,7 @@ class GraphLoop:
         if engine.waiting:
             return []  # a board may yet tell where these were made
         passed = [p for p in sensed.bundle.picks if p.camera != "b_rgb" and p.stamp_ns < engine.end_ns]
-        found = [p for p in passed if engine.seen_from(p.camera, p.stamp_ns) is None]
+        found = [p for p in passed if p.stamp_ns not in engine.keyframe_at]
         self.counts["picks_too_late"] += len(found)
         return found
 

@@ -10,6 +10,7 @@ from ...factors.measurements import StereoFrame
 from ..undistort import distort, undistort
 from . import points
 from .detection import apart, detect
+from .finding import FADING, Finding
 from .flow import checked_flow, inside
 from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
 from .keyframes import keyframe_reason
@@ -18,7 +19,7 @@ from .motion import Motion, estimate_motion
 from .noise import NoiseModel
 from .observer import Keyview, Observer, expected_depth
 from .pair import StereoPair, prepare
-from .places import ALIKE, PlaceStore, Relocalisation
+from .places import PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
 from .sighting import Sighting, blind_frame, nothing_seen
@@ -29,10 +30,6 @@ Bool = NDArray[np.bool_]
 Early = Callable[[Float, int], object]
 """Takes `last_T_this` (4, 4) by the flow alone and its number of inliers, while a keyframe is still in the making."""
 
-_FADING = 0.7
-"""Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
-_STRAYED_ALIKE = 0.4
-"""Correlation of thumbnails from which on a place is worth a look after the tracks have broken."""
 _CALM_PX = 1.5
 """Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
@@ -55,7 +52,7 @@ class StereoFrontEnd:
         self.settings = settings or StereoSettings()
         self.rig = StereoGeometry(left, right, m_left_T_m_right)
         self.landmarks = LandmarkStore(self.settings.store_landmarks)
-        self.places = PlaceStore(self.settings.store_keyframes, self.rig)
+        self.finding = Finding(PlaceStore(self.settings.store_keyframes, self.rig), self.settings)
         self._diagonal = float(np.hypot(left.width, left.height))
         self._noise = NoiseModel()
         self._vertical = VerticalCorrection(self.rig)
@@ -70,8 +67,6 @@ class StereoFrontEnd:
         self._velocity = np.zeros(6)
         self._surprise_px = np.inf
         """By how much the last flow differed from what constant velocity foretold."""
-        self._strayed_ns: int | None = None
-        """When the tracks broke without a known place having been found since."""
 
     @property
     def chain_T_keyframe(self) -> Float:
@@ -117,7 +112,7 @@ class StereoFrontEnd:
 
         `process` calls the same search by itself when the tracks break.
         """
-        return self.places.find(prepare(stamp_ns, left, right).left, self.settings.min_relocalisation)
+        return self.finding.find(prepare(stamp_ns, left, right).left)
 
     def match_landmarks(self, ids: Int, points_m: Float) -> tuple[Int, Sighting]:
         """Looks for old landmarks in the last keyframe's images, near where an estimate expects them.
@@ -341,20 +336,16 @@ class StereoFrontEnd:
         The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
         """
         nothing = no_tracks(self._observer.grid), nothing_seen()
-        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
-        if self._strayed_ns is not None:
-            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
-        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation, alike)
+        found = self.finding.look_back(view.pair.left, view.pair.stamp_ns)
         if found is None:
             return nothing
-        drifted = self._chain_T_keyframe
-        self._chain_T_keyframe = self.places.chain_pose(found.stamp_ns) @ found.keyframe_T_this
+        drifted, self._chain_T_keyframe = self._chain_T_keyframe, found
         tracks, seen, correction = self._seen_again(view)
         if len(tracks) < self.settings.min_inliers:
             self._chain_T_keyframe = drifted
             return nothing
         self._correct_chain(correction)
-        self._strayed_ns = None
+        self.finding.verified()
         return tracks, seen
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
@@ -367,10 +358,8 @@ class StereoFrontEnd:
         self._keyframe_count = len(tracks)
         variance = sighting.left_covariance[:, 1, 1] + sighting.right_covariance[:, 1, 1]
         self._vertical.learn(sighting.left_px, sighting.right_px, variance)
-        pair = view.pair
-        self.places.add(pair.stamp_ns, self._chain_T_keyframe, pair.left, tracks.ids, tracks.raw_px, tracks.points)
-        return StereoFrame(
-            stamp_ns=pair.stamp_ns,
+        frame = StereoFrame(
+            stamp_ns=view.pair.stamp_ns,
             is_keyframe=True,
             track_ids=tracks.ids.copy(),
             left_px=sighting.left_px,
@@ -381,21 +370,20 @@ class StereoFrontEnd:
             motion_inliers=inliers,
             lost=lost,
         )
+        self.finding.remember(frame, self._chain_T_keyframe, view.pair.left, tracks.raw_px, tracks.points)
+        return frame
 
     # -- losing and finding --------------------------------------------------------------------------------------
 
     def _recover(self, pair: StereoPair, guess: Float) -> StereoFrame:
         """The tracks do not connect: goes on from a remembered place, or from where constant velocity leads to."""
+        assert self._last is not None
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
-        found = self.places.find(pair.left, self.settings.min_relocalisation)
-        if not found and self._strayed_ns is None:
-            self._strayed_ns = self._last.stamp_ns if self._last is not None else None
-        if found:
-            self._strayed_ns = None
-            chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
+        chain_T_this = self.finding.lost(pair.left, self._last.stamp_ns)
+        if chain_T_this is not None:
             last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
-        self._velocity = _FADING * self._velocity
+        self._velocity = FADING * self._velocity
         return self._restart(pair, last_T_this, lost=True)
 
     def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
