@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from surecut.estimator import sensed_log
 from surecut.estimator.optimise import rig_of
 from surecut.estimator.sensed_log import SensedElsewhere, SensedHere, opened
 from surecut.factors.errors import LogError, SurecutError
@@ -18,7 +19,16 @@ def rig():
         return rig_of(reader, None)
 
 
-def test_another_process_sees_the_same():
+@pytest.fixture(params=[True, False], ids=["copies", "fresh"])
+def forks(request, monkeypatch):
+    """Processes that are copies of this one, and such as load for themselves."""
+    if request.param and not sensed_log.may_fork():
+        pytest.skip("this process has threads already, or the system makes no copies")
+    monkeypatch.setattr(sensed_log, "may_fork", lambda: request.param)
+
+
+@pytest.mark.usefixtures("forks")
+def test_other_processes_see_the_same():
     with opened(SAMPLE, rig(), 1) as here, opened(SAMPLE, rig(), 2) as elsewhere:
         count = 0
         for one, other in zip(here, elsewhere, strict=True):
@@ -26,6 +36,9 @@ def test_another_process_sees_the_same():
             assert one.stamp_ns == other.stamp_ns
             assert (one.pair is None) == (other.pair is None)
             assert one.cameras.keys() == other.cameras.keys()
+            assert (one.depth is None) == (other.depth is None)
+            assert one.clicked.keys() == other.clicked.keys()
+            assert (one.bundle.frame is None) == (other.bundle.frame is None)
             if one.bundle.frame is not None and other.bundle.frame is not None:
                 np.testing.assert_array_equal(one.bundle.frame.track_ids, other.bundle.frame.track_ids)
                 np.testing.assert_array_equal(one.bundle.frame.left_px, other.bundle.frame.left_px)
@@ -45,9 +58,13 @@ def test_an_error_of_the_front_ends_comes_across(tmp_path):
         list(recording)
 
 
-def test_a_killed_process_is_told():
+@pytest.mark.usefixtures("forks")
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_killed_process_is_told(which, monkeypatch):
+    monkeypatch.setattr(sensed_log, "AHEAD", 4)  # so that neither can have ended before
     with SensedElsewhere(SAMPLE, rig()) as recording:
-        assert recording._process is not None
-        recording._process.kill()
+        seen = iter(recording)
+        next(seen)
+        recording._processes[which].kill()
         with pytest.raises(SurecutError, match=r"sample.mcap: the process that reads it was killed \(exit code -9\)"):
-            list(recording)
+            list(seen)

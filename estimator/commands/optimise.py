@@ -167,15 +167,18 @@ def _with_progress(job: Job) -> Result:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(job.log.name, total=None)
-        start, length = _time_range(job.log)
-        bar.update(task, total=length)
+    start, length = _time_range(job.log)
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task(job.log.name, total=length)
 
-        def advance(stamp_ns: int) -> None:
-            bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
+    def advance(stamp_ns: int) -> None:
+        bar.start()  # the bar has a thread, without which the front ends can be copies of this process
+        bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
+    try:
         result = optimise(job.log, job.rig, job.between, advance, job.command, processes=PROCESSES)
+    finally:
+        bar.stop()
     _write(job, result)
     return result
 

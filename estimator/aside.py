@@ -13,7 +13,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from ...factors.errors import SurecutError
+from ..factors.errors import SurecutError
 
 Made = TypeVar("Made")
 
