@@ -18,11 +18,10 @@ from ..io.messages import PointsBody, PoseBody
 from ..io.reader import LogReader
 from .campaign_row import Row, failed_row, row_of
 from .evaluate import evaluate
-from .faults import pose_section
 from .measurement_level_truth import TrueCamera, TruePipe, TrueRig, Truth
 from .recording import simulate
-from .rigid import rigid
 from .scenario import Scenario
+from .stated_mount import with_mount_anew
 
 POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
 POINTS = "/truth/points"
@@ -69,7 +68,7 @@ def row_of_log(number: int, name: str, log: Path, mount_anew: bool = False) -> R
     watch, truth = Stopwatch(), truth_of_log(log)
     try:
         with watch("estimate"), TemporaryDirectory(prefix="surecut-rig-") as folder:
-            result = optimise(log, _with_mount_anew(log, truth, number, Path(folder)) if mount_anew else None)
+            result = optimise(log, _rig_file(Path(folder), log, truth, number) if mount_anew else None)
     except SurecutError as error:
         return failed_row(number, name, str(error))
     row = row_of(number, name, result, evaluate(result, truth))
@@ -78,18 +77,12 @@ def row_of_log(number: int, name: str, log: Path, mount_anew: bool = False) -> R
     return row
 
 
-def _with_mount_anew(log: Path, truth: Truth, seed: int, folder: Path) -> Path:
-    """The log's rig with a mount that somebody else might have measured, of the tolerance that the rig states."""
+def _rig_file(folder: Path, log: Path, truth: Truth, seed: int) -> Path:
+    """The log's rig with its mount drawn anew."""
     with LogReader(log, ()) as reader:
-        rig = rig_of(reader, None)
-    if rig.mount is None:
-        raise SurecutError(f"{log}: its rig has no mount that could be drawn anew")
-    rng = np.random.default_rng(seed)
-    f_T_b = truth.rig.f_T_b @ rigid(rng.normal(0, rig.mount.rotation_sigma_rad, 3))
-    f_T_b[:3, 3] += rng.normal(0, rig.mount.translation_sigma_m, 3)
+        rig = with_mount_anew(rig_of(reader, None), truth.rig.f_T_b, seed)
     path = folder / "rig.yaml"
-    mount = rig.mount.model_copy(update={"f_T_b": pose_section(f_T_b)})
-    path.write_text(dump_rig(rig.model_copy(update={"mount": mount})))
+    path.write_text(dump_rig(rig))
     return path
 
 
