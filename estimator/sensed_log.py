@@ -20,6 +20,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
 from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 AHEAD = 64
 """Stamps that each process may be ahead of the next: what bounds the memory."""
 POLL_S = 1.0
+SHARED_SIZE = 256
+"""Rows of a matrix whose products are shared among threads, if there are any."""
 
 
 def opened(log: Path, rig: Rig, processes: int = 1) -> "AbstractContextManager[SensedLog]":
@@ -132,7 +136,11 @@ class SensedElsewhere:
 def may_fork() -> bool:
     """Is a copy of this process safe? It has none of the threads, and whatever these have locked stays locked."""
     tasks = Path("/proc/self/task")
-    return "fork" in multiprocessing.get_all_start_methods() and tasks.is_dir() and len([*tasks.iterdir()]) == 1
+    if "fork" not in multiprocessing.get_all_start_methods() or not tasks.is_dir():
+        return False
+    work = np.ones((SHARED_SIZE, SHARED_SIZE))
+    np.linalg.norm(work @ work)  # where NumPy has threads for this, they are there now
+    return len([*tasks.iterdir()]) == 1
 
 
 def _follow(log: Path, rig: Rig, out: Any) -> None:

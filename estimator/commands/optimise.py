@@ -149,10 +149,11 @@ def _write(job: Job, result: Result) -> None:
     for path in (job.output, job.json, job.tum):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+    text = to_json(result) if job.output is not None or job.json is not None else ""
     if job.output is not None:
-        write_result(job.output, result)
+        write_result(job.output, result, text)
     if job.json is not None:
-        write_text(job.json, to_json(result))
+        write_text(job.json, text)
     if job.tum is not None:
         write_text(job.tum, tum_text(result, job.frame))
 
