@@ -42,6 +42,8 @@ of a batch solution; `settle` makes up for what is left at the end."""
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
 
+SETTLE_ROUNDS = 8
+"""Steps at the end, at most: it takes that many where much was learnt last."""
 MOVED_ROUNDS = 3
 """Steps after a part of the map was moved."""
 
@@ -268,7 +270,7 @@ class Incremental:
         self._values, self._relocated = values, True
         return gtsam.Values(values)
 
-    def settle(self, rounds: int) -> gtsam.Values:
+    def settle(self, rounds: int = SETTLE_ROUNDS) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.
 
         While it runs it relinearises what has moved far enough, now and then; what many small moves make together,
