@@ -13,6 +13,7 @@ from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
 from ...factors.measurements import Pick
 from ...factors.rig import Rig, sha256_of
+from ..aside import Aside
 from ..bounded import Bounded
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
@@ -20,7 +21,6 @@ from ..points_in_base import pipe_estimate, point_blocks, radius95
 from ..result import PipeEstimate, PointEstimate, PoseEstimate, Result
 from ..sensing import Sensed
 from ..validated_range import ValidatedRange
-from .aside import Aside
 from .audits import Audits
 from .calibration import departures, held, hold
 from .glances import Glance
