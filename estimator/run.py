@@ -11,6 +11,7 @@ from .batch import BatchSolution, solve
 from .board_faults import settle_boards
 from .bundle import bundles
 from .engine import Engine
+from .pipe_tracks import leave_out_pipe_tracks
 from .result import Result
 from .summary import Summary
 from .surfaces import Associator
@@ -31,6 +32,7 @@ def solved(engine: Engine) -> BatchSolution:
             "there is nothing to estimate: no stereo pair and no known marker was seen; check topics and marker ids in "
             "the rig file (`surecut info LOG`)"
         )
+    leave_out_pipe_tracks(engine)
     engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
     solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
     return settle_boards(engine, solution)
