@@ -106,7 +106,6 @@ class Incremental:
         self.log.append(update)
         self.log.off.update(removed)
         if self._relocated:
-            self._relocated = False
             self._values.insert(update.values)
             self._begin(self._values)
             return self.settle(MOVED_ROUNDS)
@@ -136,6 +135,16 @@ class Incremental:
     def _drop(self, landmark: int) -> None:
         """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
         self.dropped.append(landmark)
+        self._erase(landmark)
+
+    def leave_out(self, landmarks: Iterable[int]) -> gtsam.Values:
+        """Takes landmarks out with all of their factors; `settle` or the next update begins anew without them."""
+        for landmark in landmarks:
+            self._erase(landmark)
+        self._relocated = True
+        return gtsam.Values(self._values)
+
+    def _erase(self, landmark: int) -> None:
         for index, factor, record in [row for row in self.log.active() if landmark in row[1].keys()]:
             prior = joint_of(factor, self._values) if record.family == FAMILY else None
             rest = None if prior is None else without(prior, {landmark})
@@ -250,6 +259,7 @@ class Incremental:
     def _begin(self, values: gtsam.Values) -> None:
         """iSAM2 anew on all factors, linearised at `values`."""
         self._unheld.clear()
+        self._relocated = False
         self._isam = gtsam.ISAM2(_parameters())
         self._values = values
         try:
