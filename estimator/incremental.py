@@ -135,24 +135,24 @@ class Incremental:
     def _drop(self, landmark: int) -> None:
         """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
         self.dropped.append(landmark)
-        self._erase(landmark)
+        self._erase({landmark})
 
     def leave_out(self, landmarks: Iterable[int]) -> gtsam.Values:
         """Takes landmarks out with all of their factors; `settle` or the next update begins anew without them."""
-        for landmark in landmarks:
-            self._erase(landmark)
+        self._erase(set(landmarks))
         self._relocated = True
         return gtsam.Values(self._values)
 
-    def _erase(self, landmark: int) -> None:
-        for index, factor, record in [row for row in self.log.active() if landmark in row[1].keys()]:
+    def _erase(self, landmarks: set[int]) -> None:
+        for index, factor, record in [row for row in self.log.active() if not landmarks.isdisjoint(row[1].keys())]:
             prior = joint_of(factor, self._values) if record.family == FAMILY else None
-            rest = None if prior is None else without(prior, {landmark})
+            rest = None if prior is None else without(prior, landmarks)
             if rest is None:
                 self.log.off.add(index)
             else:  # what is known of everything else does not go with it
                 self.log.replace(index, rest.factor())
-        self._values.erase(landmark)
+        for landmark in landmarks:
+            self._values.erase(landmark)
 
     def _rebuild(self) -> None:
         """Starts iSAM2 anew from a damped batch optimum.
