@@ -12,7 +12,9 @@ from ..factors.camera import CameraModel
 from ..factors.measurements import MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
+from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early
+from ..frontends.stereo.places import place_of
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
@@ -36,6 +38,8 @@ class Sensed:
     """What was clicked, by camera, stamp and point id."""
     cameras: Mapping[str, CameraModel] = field(default_factory=dict)
     """Cameras whose calibration has become known with this stamp."""
+    atlas: Atlas | None = None
+    """What a keyframe adds to what can be found again."""
 
     @property
     def stamp_ns(self) -> int:
@@ -57,9 +61,13 @@ class SensingReport:
 class Sensing:
     """Front ends of one run, fed with messages."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, atlas: Atlas | None = None) -> None:
+        """
+        Args:
+            atlas: what an earlier run saw.
+        """
         self.rig = rig
-        self.sensors = Sensors(rig)
+        self.sensors = Sensors(rig, atlas)
         self._order = OrderReport()
         self._pairing = PairingReport()
         self._sides = Sides(rig)
@@ -86,7 +94,8 @@ class Sensing:
 
     def process(self, group: list[Item]) -> Sensed:
         """All messages of one stamp."""
-        return self.look(group, self.follow(group))
+        frame = self.follow(group)
+        return self.look(group, frame, self.memorable(frame))
 
     def follow(self, group: list[Item], early: Early | None = None) -> StereoFrame | None:
         """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
@@ -102,11 +111,16 @@ class Sensing:
         clicked = any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
         return self.sensors.track(pair, clicked, early) if pair is not None else None
 
-    def look(self, group: list[Item], frame: StereoFrame | None) -> Sensed:
+    def memorable(self, frame: StereoFrame | None) -> Memorable | None:
+        """What the frame that was followed last added to what can be found again."""
+        return None if frame is None else self.sensors.memorable()
+
+    def look(self, group: list[Item], frame: StereoFrame | None, memorable: Memorable | None = None) -> Sensed:
         """Everything else that a group shows.
 
         Args:
             frame: what `follow`, of this object or another, has said of the pair.
+            memorable: and what it added to what can be found again.
 
         Raises:
             LogError: a part of it cannot be used.
@@ -131,6 +145,7 @@ class Sensing:
             kept,
             self._clicked(picks, pair, group),
             fresh,
+            None if memorable is None else _atlas_of(memorable),
         )
 
     def look_back(self, clicks: Sequence[Message], pair: PairImages, frame: StereoFrame) -> Sensed:
@@ -230,6 +245,12 @@ class Sensing:
             if image is not None:
                 found[pick.camera, pick.stamp_ns, pick.point_id] = cut_out(image, pick.raw_px)
         return found
+
+
+def _atlas_of(memorable: Memorable) -> Atlas:
+    """With the view described."""
+    view = memorable.view
+    return Atlas(() if view is None else (place_of(view),), memorable.tracks)
 
 
 def images(pair: StereoPair) -> PairImages:

@@ -9,6 +9,7 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import StereoFrame
 from ..undistort import distort, undistort
 from . import points
+from .atlas import Atlas, Memorable, settled_tracks
 from .detection import apart, detect
 from .flow import checked_flow, inside
 from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
@@ -18,7 +19,7 @@ from .motion import Motion, estimate_motion
 from .noise import NoiseModel
 from .observer import Keyview, Observer, expected_depth
 from .pair import StereoPair, prepare
-from .places import ALIKE, PlaceStore, Relocalisation
+from .places import ALIKE, BEFORE_ALL_NS, PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
 from .sighting import Sighting, blind_frame, nothing_seen
@@ -33,6 +34,8 @@ _FADING = 0.7
 """Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
 _STRAYED_ALIKE = 0.4
 """Correlation of thumbnails from which on a place is worth a look after the tracks have broken."""
+_APART_M = 1000.0
+"""Between chains that nothing joins."""
 _CALM_PX = 1.5
 """Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
@@ -72,11 +75,28 @@ class StereoFrontEnd:
         """By how much the last flow differed from what constant velocity foretold."""
         self._strayed_ns: int | None = None
         """When the tracks broke without a known place having been found since."""
+        self.memorable: Memorable | None = None
+        """What the last pair added to what can be found again."""
+        self._own_from: int | None = None
+        """First track id of this run, while its chain has not been joined to that of an earlier run."""
 
     @property
     def chain_T_keyframe(self) -> Float:
         """Shape (4, 4): the last keyframe's pose in the front end's own chain, corrected where places come back."""
         return self._chain_T_keyframe.copy()
+
+    def recall(self, atlas: Atlas) -> None:
+        """Before the first pair: begins with what an earlier run saw, as after a loss of sight.
+
+        Until one of its places is seen, the own chain begins so far from all of them that none is taken to be near.
+        """
+        if not atlas:
+            return
+        self.landmarks.recall(atlas.tracks)
+        self.places.recall(atlas.places)
+        self._next_id = self._own_from = atlas.next_id()
+        far = [place.chain_T_keyframe[:3, 3] for place in atlas.places]
+        self._chain_T_keyframe[0, 3] = _APART_M + max((float(np.abs(t).max()) for t in far), default=0.0)
 
     def process(
         self,
@@ -96,8 +116,11 @@ class StereoFrontEnd:
             early: told of a keyframe's motion before the work on it begins, which takes ten times as long.
         """
         pair = prepare(stamp_ns, left, right)
+        self.memorable = None
         if self._last is None:
             self._last = pair
+            if self._own_from is not None:
+                return self._recover(pair, np.eye(4))
             return self._restart(pair, np.eye(4), lost=False)
         guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
         self._track(self._last, pair, guess)
@@ -341,10 +364,7 @@ class StereoFrontEnd:
         The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
         """
         nothing = no_tracks(self._observer.grid), nothing_seen()
-        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
-        if self._strayed_ns is not None:
-            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
-        found = self.places.look_back(view.pair.left, before_ns, 2 * self.settings.min_relocalisation, alike)
+        found = self._place_of_before(view)
         if found is None:
             return nothing
         drifted = self._chain_T_keyframe
@@ -355,7 +375,18 @@ class StereoFrontEnd:
             return nothing
         self._correct_chain(correction)
         self._strayed_ns = None
+        self._join(self._chain_T_keyframe @ inverse(drifted), found)
         return tracks, seen
+
+    def _place_of_before(self, view: Keyview) -> Relocalisation | None:
+        """A remembered place that a keyframe may show."""
+        left, least = view.pair.left, 2 * self.settings.min_relocalisation
+        if self._own_from is not None:
+            return next(iter(self.places.find(left, least, BEFORE_ALL_NS)), None)
+        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
+        if self._strayed_ns is not None:
+            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
+        return self.places.look_back(left, before_ns, least, alike)
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
         """Takes up the drift that landmarks seen again show; the points of living tracks are relative and stay."""
@@ -367,8 +398,9 @@ class StereoFrontEnd:
         self._keyframe_count = len(tracks)
         variance = sighting.left_covariance[:, 1, 1] + sighting.right_covariance[:, 1, 1]
         self._vertical.learn(sighting.left_px, sighting.right_px, variance)
-        pair = view.pair
-        self.places.add(pair.stamp_ns, self._chain_T_keyframe, pair.left, tracks.ids, tracks.raw_px, tracks.points)
+        pair, pose = view.pair, self._chain_T_keyframe
+        added = self.places.add(pair.stamp_ns, pose, pair.left, tracks.ids, tracks.raw_px, tracks.points)
+        self.memorable = Memorable(settled_tracks(tracks, pose), added)
         return StereoFrame(
             stamp_ns=pair.stamp_ns,
             is_keyframe=True,
@@ -388,15 +420,30 @@ class StereoFrontEnd:
         """The tracks do not connect: goes on from a remembered place, or from where constant velocity leads to."""
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
-        found = self.places.find(pair.left, self.settings.min_relocalisation)
+        found = self.places.find(pair.left, self.settings.min_relocalisation * (1 if self._own_from is None else 2))
         if not found and self._strayed_ns is None:
             self._strayed_ns = self._last.stamp_ns if self._last is not None else None
         if found:
             self._strayed_ns = None
             chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
-            last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
+            chain_T_last = self._chain_T_keyframe @ self._keyframe_T_last
+            if self._join(chain_T_this @ inverse(chain_T_last @ last_T_this), found[0]):
+                # The chain has moved, not the camera.
+                self._chain_T_keyframe = chain_T_this @ inverse(self._keyframe_T_last @ last_T_this)
+            else:
+                last_T_this = inverse(chain_T_last) @ chain_T_this
         self._velocity = _FADING * self._velocity
         return self._restart(pair, last_T_this, lost=True)
+
+    def _join(self, new_T_old: Float, found: Relocalisation) -> bool:
+        """The own chain becomes part of an earlier run's, if it was not and the place is one of then."""
+        if self._own_from is None or found.stamp_ns >= BEFORE_ALL_NS:
+            return False
+        self.places.move(new_T_old)
+        self.landmarks.move(self._own_from, new_T_old)
+        self._tracks.patch_poses = new_T_old @ self._tracks.patch_poses
+        self._own_from = None
+        return True
 
     def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
         """A keyframe of landmarks seen again and new tracks; no keyframe where the view holds nothing to start from."""
