@@ -63,11 +63,20 @@ class Correlation:
     """Variance of the mean of a track's errors, on average, over that of white ones of the stated variance."""
 
 
-def correlate(active: Active, values: gtsam.Values, system: LinearSystem, family: str) -> Correlation | None:
+def correlate(
+    active: Active, values: gtsam.Values, system: LinearSystem, family: str, least: float = 1.0
+) -> Correlation | None:
     """The errors of a family's tracks; None where too few tracks are long enough to tell.
 
     What neighbours share is not a matter of one track: it raises all of them by what it does to the camera's motion
     over a second.
+
+    Args:
+        active: all factors of a system.
+        values: where it was linearised.
+        system: the system.
+        family: whose tracks are meant.
+        least: what tracks must contribute to motions, over what their own covariance says, for the latter to hold.
     """
     tracks = Tracks(active, family)
     if len(tracks.track) == 0 or int((tracks.track[LAGS:] == tracks.track[:-LAGS]).sum()) < FEWEST_PAIRS:
@@ -78,7 +87,7 @@ def correlate(active: Active, values: gtsam.Values, system: LinearSystem, family
     influence = _influence_on_motions(tracks, values, system)
     if influence is not None:
         effect = _design_effect(tracks, system, influence, found, neighbours)
-        effect *= _group_effect(tracks, values, system, influence, found * np.sqrt(effect))
+        effect *= _group_effect(tracks, values, system, influence, found * np.sqrt(effect), least)
     return Correlation(found * np.sqrt(effect), _inflation(tracks, own * effect))
 
 
@@ -106,14 +115,14 @@ def _design_effect(
 
 
 def _group_effect(
-    tracks: "Tracks", values: gtsam.Values, system: LinearSystem, influence: Float, found: csr_matrix
+    tracks: "Tracks", values: gtsam.Values, system: LinearSystem, influence: Float, found: csr_matrix, least: float
 ) -> float:
     """Variance of motions by what whole groups of tracks contribute to them over what the errors' covariance says.
 
     What a track contributes is a sum over its views, whatever makes them alike, and however much tracks differ in how
     wrong they are; tracks of one part of the scene may be wrong together (cluster-robust variance; Liang and Zeger
     1986). Residuals are smaller than errors: those of errors that are drawn from the covariance tell by how much. The
-    worse of the two accounts counts, and one at least.
+    worse of the two accounts counts, and `least` at least.
     """
     errors = found @ np.random.default_rng(1).normal(size=(len(system.b), DRAWS))
     residuals = np.column_stack([system.b, errors - system.A @ system.solve(system.A.T @ errors)])
@@ -123,7 +132,7 @@ def _group_effect(
     np.add.at(whole, tracks.track, own)
     ratios = [_contributed(whole)]
     ratios.append(float(np.mean([_contributed(_summed(whole, group)) for group in _parts(tracks, values)])))
-    return max(*ratios, 1.0)
+    return max(*ratios, least)
 
 
 def _contributed(groups: Float) -> float:

@@ -62,13 +62,14 @@ def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> L
     """The same with covariances that know that the errors of a family's tracks are correlated.
 
     Args:
-        slack: what else the standard deviations of their errors grow by.
+        slack: what the estimate's variances are over those of weights known beforehand (`track_weights`). What the
+            tracks contribute is smaller by as much, so that it enters squared beside an account of contributions.
     """
-    found = correlate(at.active, at.values, at.system, family)
+    found = correlate(at.active, at.values, at.system, family, 1.0 / slack)
     if found is None and slack == 1.0:
         return at
     mine = np.repeat([record.family == family for _, _, record in at.active], at.system.rows)
-    own = csr_matrix(diags(np.where(mine, slack, 1.0)))
+    own = csr_matrix(diags(np.where(mine, np.sqrt(slack) if found is None else slack, 1.0)))
     at.system.root = own if found is None else csr_matrix(own @ found.root)
-    inflation = 1.0 if found is None else found.inflation
-    return Linearised(at.values, at.active, at.system, at.norms, inflation * slack**2)
+    inflation = slack if found is None else found.inflation * slack**2
+    return Linearised(at.values, at.active, at.system, at.norms, inflation)

@@ -34,11 +34,22 @@ class Campaign:
     sensitivity: bool = False
     recordings: Path | None = None
     """Folder that keeps the rendered recordings, to run a later estimator on the same ones."""
+    mounts_anew: bool = False
+    """With images: the rig's mount is drawn anew for every run, so that a recording serves several times."""
 
     def order(self, number: int) -> RunOrder:
         """The order of one run."""
         scenario = self.scenarios[number % len(self.scenarios)]
-        return RunOrder(number, self.level, scenario, self.leave_out, self.decisions, self.sensitivity, self.recordings)
+        return RunOrder(
+            number,
+            self.level,
+            scenario,
+            self.leave_out,
+            self.decisions,
+            self.sensitivity,
+            self.recordings,
+            self.mounts_anew,
+        )
 
 
 def open_campaign(
@@ -48,6 +59,7 @@ def open_campaign(
     decisions: bool = False,
     sensitivity: bool = False,
     recordings: Path | None = None,
+    mounts_anew: bool = False,
 ) -> Campaign:
     """A campaign from a scenario file or the name of one that comes with surecut; images also from a folder of
     simulated recordings.
@@ -55,6 +67,8 @@ def open_campaign(
     Raises:
         SurecutError: there is no such scenario, or something in it is wrong.
     """
+    if mounts_anew and level != "pixels":
+        raise SurecutError("mounts are drawn anew for recordings only: every run of measurements draws its own")
     if recordings is not None:
         recordings.mkdir(parents=True, exist_ok=True)
     if level == "pixels":
@@ -65,7 +79,7 @@ def open_campaign(
             names = ", ".join(sorted(one.stem for one in SCENARIOS.glob("*.yaml")))
             raise SurecutError(f"{source}: no such scenario; give a YAML file or one of {names}")
         found = tuple(scenario.model_dump(mode="json") for scenario in load_scenarios(path))
-    return Campaign(level, found, leave_out, decisions, sensitivity, recordings)
+    return Campaign(level, found, leave_out, decisions, sensitivity, recordings, mounts_anew)
 
 
 def _rendered(source: str) -> tuple[Mapping[str, Any], ...]:
@@ -121,6 +135,7 @@ def claim_folder(folder: Path, campaign: Campaign) -> None:
         "leave_out": campaign.leave_out,
         "decisions": campaign.decisions,
         **({"sensitivity": True} if campaign.sensitivity else {}),
+        **({"mounts_anew": True} if campaign.mounts_anew else {}),
     }
     path = folder / SETTINGS
     if path.exists():

@@ -13,6 +13,7 @@ from ..estimator.items import wanted_topics
 from ..estimator.optimise import optimise, rig_of
 from ..estimator.stopwatch import Stopwatch
 from ..factors.errors import LogError, SurecutError
+from ..factors.rig import dump_rig
 from ..io.messages import PointsBody, PoseBody
 from ..io.reader import LogReader
 from .campaign_row import Row, failed_row, row_of
@@ -20,6 +21,7 @@ from .evaluate import evaluate
 from .measurement_level_truth import TrueCamera, TruePipe, TrueRig, Truth
 from .recording import simulate
 from .scenario import Scenario
+from .stated_mount import with_mount_anew
 
 POSES = {name: f"/truth/pose/{name}" for name in ("m", "b", "f")}
 POINTS = "/truth/points"
@@ -27,20 +29,23 @@ LOG = "log"
 """Key of a scenario that is a recording already: its path."""
 
 
-def run_pixels(number: int, scenario: Mapping[str, Any], recordings: Path | None = None) -> Row:
+def run_pixels(
+    number: int, scenario: Mapping[str, Any], recordings: Path | None = None, mounts_anew: bool = False
+) -> Row:
     """Renders with the run's number as seed, or takes a recording that is there.
 
     Args:
         recordings: folder that keeps the recordings; one that is there already is not rendered again.
             Without it they are gone afterwards.
+        mounts_anew: the rig states another mount than when it was rendered, drawn with the run's number as seed.
     """
     if LOG in scenario:
-        return row_of_log(number, str(scenario["name"]), Path(scenario[LOG]))
+        return row_of_log(number, str(scenario["name"]), Path(scenario[LOG]), mounts_anew)
     wanted = Scenario.model_validate(dict(scenario))
     if recordings is None:
         with TemporaryDirectory(prefix="surecut-campaign-") as folder:
-            return row_of_log(number, wanted.name, rendered(Path(folder), number, wanted))
-    return row_of_log(number, wanted.name, rendered(recordings, number, wanted))
+            return row_of_log(number, wanted.name, rendered(Path(folder), number, wanted), mounts_anew)
+    return row_of_log(number, wanted.name, rendered(recordings, number, wanted), mounts_anew)
 
 
 def rendered(folder: Path, number: int, scenario: Scenario) -> Path:
@@ -51,19 +56,34 @@ def rendered(folder: Path, number: int, scenario: Scenario) -> Path:
     return log
 
 
-def row_of_log(number: int, name: str, log: Path) -> Row:
-    """Estimate of a simulated log and its errors."""
-    watch = Stopwatch()
+def row_of_log(number: int, name: str, log: Path, mount_anew: bool = False) -> Row:
+    """Estimate of a simulated log and its errors.
+
+    Args:
+        number: seed of what is drawn.
+        name: of the scenario.
+        log: carries its rig and its truth.
+        mount_anew: the rig gets another mount.
+    """
+    watch, truth = Stopwatch(), truth_of_log(log)
     try:
-        with watch("estimate"):
-            result = optimise(log)
+        with watch("estimate"), TemporaryDirectory(prefix="surecut-rig-") as folder:
+            result = optimise(log, _rig_file(Path(folder), log, truth, number) if mount_anew else None)
     except SurecutError as error:
         return failed_row(number, name, str(error))
-    truth = truth_of_log(log)
     row = row_of(number, name, result, evaluate(result, truth))
     row["seconds"] = watch.seconds["estimate"]
     row["chain"] = chain_errors_of_log(log, truth)
     return row
+
+
+def _rig_file(folder: Path, log: Path, truth: Truth, seed: int) -> Path:
+    """The log's rig with its mount drawn anew."""
+    with LogReader(log, ()) as reader:
+        rig = with_mount_anew(rig_of(reader, None), truth.rig.f_T_b, seed)
+    path = folder / "rig.yaml"
+    path.write_text(dump_rig(rig))
+    return path
 
 
 def chain_errors_of_log(log: Path, truth: Truth) -> list[float]:

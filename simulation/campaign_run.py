@@ -36,12 +36,13 @@ class RunOrder:
     sensitivity: bool = False
     recordings: Path | None = None
     """Folder that keeps what is rendered."""
+    mounts_anew: bool = False
 
 
 def run(order: RunOrder) -> Row:
     """One run. What the input cannot give is a row with its reason; a defect raises."""
     if order.level == "pixels":
-        return run_pixels(order.number, order.scenario, order.recordings)
+        return run_pixels(order.number, order.scenario, order.recordings, order.mounts_anew)
     return run_measurements(
         order.number,
         Scenario.model_validate(order.scenario),

@@ -6,11 +6,13 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surecut.estimator.decision import tolerance_probability
 from surecut.estimator.executor import SerialExecutor
 from surecut.estimator.validated_range import QUANTITIES, load_validated_range, range_text, seal
-from surecut.factors.errors import SurecutError
+from surecut.factors.errors import RigError, SurecutError
+from surecut.factors.rig import Board, Marker, Mount, Pose, Rig
 from surecut.simulation import campaign as campaign_module
 from surecut.simulation.campaign import Campaign, failures, open_campaign, run_campaign
 from surecut.simulation.campaign_decisions import _cuts, ideal_covariances
@@ -22,6 +24,8 @@ from surecut.simulation.campaign_table import coverage_at, tabulate, write_table
 from surecut.simulation.campaign_validation import update_validation, validation_section
 from surecut.simulation.evaluate import point_quantity, scalar_quantity
 from surecut.simulation.measurement_level_scenario import Scenario, load_scenarios
+from surecut.simulation.rigid import inverse, rigid
+from surecut.simulation.stated_mount import with_mount_anew
 
 SHORT = Scenario.model_validate(
     {
@@ -261,6 +265,25 @@ def test_what_is_left_out_and_what_inputs_do_is_in_table_and_page():
     page = report_html("s", table, rows)
     assert "Without one family" in page
     assert "baseline by 1 mm" in page
+
+
+def test_mounts_drawn_anew_have_the_stated_tolerance(tmp_path):
+    rig = Rig(boards=(Board(id="f0", side_m=0.075, markers=(Marker(id=0, centre_m=(0.0, 0.0)),)),))
+    with pytest.raises(RigError, match="no mount"):
+        with_mount_anew(rig, np.eye(4), 0)
+    mount = Mount(board="f0", f_T_b=Pose(), translation_sigma_m=0.004, rotation_sigma_rad=0.03)
+    rig = rig.model_copy(update={"mount": mount})
+    true = rigid((0.3, -0.2, 0.1), (0.1, 0.2, 0.3))
+    drawn = [with_mount_anew(rig, true, seed).mount for seed in range(400)]
+    off = np.array([inverse(true) @ rigid(m.f_T_b.rotation_vector_rad, m.f_T_b.translation_m) for m in drawn if m])
+    assert off[:, :3, 3].std() == pytest.approx(0.004, rel=0.06)
+    turns = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
+    assert turns.std() == pytest.approx(0.03, rel=0.06)
+    assert with_mount_anew(rig, true, 3) == with_mount_anew(rig, true, 3)
+    (tmp_path / "a.mcap").touch()
+    assert open_campaign(str(tmp_path), "pixels", mounts_anew=True).order(0).mounts_anew
+    with pytest.raises(SurecutError, match="recordings only"):
+        open_campaign("cell", "measurements", mounts_anew=True)
 
 
 def test_a_folder_of_recordings_is_a_scenario(tmp_path):

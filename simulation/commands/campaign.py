@@ -51,6 +51,14 @@ def command(
     recordings: Annotated[
         Path | None, typer.Option(help="Folder that keeps what `--level pixels` renders; what is there is used again.")
     ] = None,
+    mounts_anew: Annotated[
+        bool,
+        typer.Option(
+            "--mounts-anew",
+            help="With images: state another mount in every run, drawn about the true one, so that a recording serves "
+            "several times.",
+        ),
+    ] = False,
     real: Annotated[Path | None, typer.Option(help="Folder of real recordings: a table of these instead.")] = None,
     against: Annotated[
         Path | None, typer.Option(help="Folder of another campaign with the same seeds, to compare the points with.")
@@ -65,7 +73,7 @@ def command(
     if real is not None:
         _real(console, real, output, validation, choose_executor(jobs, dask))
         return
-    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity, recordings)
+    campaign = open_campaign(scenario, level, leave_out, decisions, sensitivity, recordings, mounts_anew)
     with _bar(console) as progress:
         task = progress.add_task("runs", total=runs)
         executor = choose_executor(jobs, dask)
@@ -77,7 +85,12 @@ def command(
     _print(console, table)
     console.print(f"{output / 'report.html'}")
     if validation is not None:
-        extras = {"decisions": decisions, "without families": leave_out, "sensitivity": sensitivity}
+        extras = {
+            "decisions": decisions,
+            "without families": leave_out,
+            "sensitivity": sensitivity,
+            "mounts anew": mounts_anew,
+        }
         name = ", ".join([Path(scenario).stem, *(extra for extra, asked in extras.items() if asked)])
         update_validation(validation, name, level, table, when)
     if range_file is not None:
