@@ -25,9 +25,16 @@ class Album:
     _places: list[AtlasPlace] = field(default_factory=list)
     _patches: dict[int, AtlasTracks] = field(default_factory=dict)
     """By track, one row each, the oldest first."""
+    _earlier: dict[int, int] = field(default_factory=dict)
+    """How many keyframes of an earlier run saw each track, in the map or not: most of it is not seen again at once."""
+
+    def recall(self, atlas: Atlas) -> None:
+        """What an earlier run kept."""
+        self._earlier = dict(zip(atlas.tracks.ids.tolist(), atlas.tracks.views.tolist(), strict=True))
+        self.add(atlas)
 
     def add(self, seen: Atlas, known: Collection[int] = ()) -> None:
-        """What a keyframe, or an earlier run, adds.
+        """What a keyframe adds.
 
         Args:
             known: tracks that are landmarks of the map.
@@ -57,14 +64,19 @@ class Album:
             views: number of keyframes that have seen each landmark of the map.
             joint: number of landmarks with covariance, at most.
         """
-        good = {t for t, n in views.items() if n >= FEWEST_VIEWS and t in self._patches}
+        counts = {t: n for t, n in (self._earlier | dict(views)).items() if n >= FEWEST_VIEWS and t in self._patches}
+        good = set(counts)
         places = self._covering(good)
-        order = _in_turn([sorted(good.intersection(p.ids.tolist()), key=lambda t: -views[t]) for p in places])
+        turns = [
+            sorted(good.intersection(p.ids.tolist()), key=lambda t: (t not in views, -counts[t], t)) for p in places
+        ]
+        order = _in_turn(turns)
         if not order:
             return Atlas(), []
-        tracks = joined([self._patches[t] for t in order[:KEPT_PATCHES]])
-        counted = np.array([views[t] for t in tracks.ids.tolist()], np.int64)
-        return Atlas(tuple(places), replace(tracks, views=counted)), order[:joint]
+        chosen = [t for t in order if t in views][:joint]
+        kept = list(dict.fromkeys([*chosen, *order]))[:KEPT_PATCHES]
+        tracks = joined([self._patches[t] for t in kept])
+        return Atlas(tuple(places), replace(tracks, views=np.array([counts[t] for t in kept], np.int64))), chosen
 
     def _covering(self, good: set[int]) -> list[AtlasPlace]:
         """Places, the one that shows most of what the others do not first; the newer one of two that show as much."""

@@ -205,7 +205,7 @@ def _recall_landmarks(engine: Engine, memory: Memory) -> None:
     engine.odometry.observations = {t: views.get(t, 0) for t in there}
     engine.odometry.seen_in = dict.fromkeys(there, memory.keyframes - 1 - AWAY)
     engine.surfaces.recall(set(memory.laid), {(x, y): count for x, y, count in memory.shared})
-    engine.album.add(memory.atlas)
+    engine.album.recall(memory.atlas)
 
 
 def _seen_by_machine(engine: Engine) -> set[str]:
