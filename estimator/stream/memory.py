@@ -34,7 +34,7 @@ from ..track_gate import AWAY
 from .memory_atlas import from_data as atlas_from_data
 from .memory_atlas import packed, unpacked
 from .memory_atlas import to_data as atlas_to_data
-from .remembered import KEY, to_data
+from .remembered import KEY, LARGEST_BYTES, to_data
 from .variables import LONG_LIVED, long_lived
 from .wire import Answer
 
@@ -45,7 +45,6 @@ READABLE = (1, 2)
 """Formats; the first knew no landmarks."""
 JOINT_LANDMARKS = 100
 """The joint of all that is kept is dense: a megabyte with so many, a fiftieth of a second for each update."""
-LARGEST_BYTES = 1 << 28
 MARK, HEAD = '"surecut_memory"', 40
 """What a checkpoint begins with, and within how many characters."""
 
@@ -253,7 +252,7 @@ def _of_result(text: str, name: str) -> str:
         if "trajectory" not in data:
             return text
         found = str(data.get("memory", ""))
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError):
         return text
     if not found:
         raise MemoryFileError(f"{name}: holds no memory of boards and machine; run `surecut optimise` again")

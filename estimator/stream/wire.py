@@ -159,6 +159,8 @@ class Died:
 
     who: str
     trace: str
+    refusal: bool = False
+    """It cannot begin with what it was given, and `trace` says why in one line."""
 
 
 @dataclass(frozen=True, slots=True)
