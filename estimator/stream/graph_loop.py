@@ -21,7 +21,7 @@ from ..result import PipeEstimate, PointEstimate, PoseEstimate, Result
 from ..sensing import Sensed
 from ..validated_range import ValidatedRange
 from .aside import Aside
-from .audit import Audit, audit
+from .audits import Audits
 from .calibration import departures, held, hold
 from .glances import Glance
 from .knocks import Knocks
@@ -73,13 +73,12 @@ class GraphLoop:
             recall(self.engine, memory)
             self._bounded.first = memory.keyframes
         self._knocks = Knocks(self.engine)
-        self._audit = Audit()
-        self._auditing: Aside[Audit] = Aside(apart)
+        self._audits = Audits(self.engine, settings.audit_period_ns, apart)
         self._saving: Aside[str] = Aside(apart)
         self._live = apart
         self._told_s = 0.0
         """When an answer was last due, by the computer's clock."""
-        self._next_audit_ns = self._next_answer_ns = 0
+        self._next_answer_ns = 0
         self._saved_s = time.monotonic()
         self._kept_points: frozenset[str] = frozenset()
         """Ids of points in the checkpoint."""
@@ -182,9 +181,10 @@ class GraphLoop:
 
     def answer(self, stamp_ns: int) -> Answer | None:
         """Tells what is known now; None while nothing is."""
-        self._take_audit()
+        self._changed |= self._audits.take()
         if self._changed or self._answer is None:
-            self._maybe_audit(stamp_ns)
+            self._audits.begin_when_due(stamp_ns)
+            self._audits.take()
             made = self._made(stamp_ns)
             if made is None:
                 return None
@@ -195,31 +195,10 @@ class GraphLoop:
                 self._answer, stamp_ns=stamp_ns, decisions=decisions, last_tie_ns=self.engine.boards.last_seen_ns()
             )
         self._answer = replace(
-            self._answer, counts=dict(self.counts), cpu_s=time.process_time(), suspects=self._knocks.suspects
+            self._answer, counts=self._counted(), cpu_s=time.process_time(), suspects=self._knocks.suspects
         )
         self._tell(self._answer)
         return self._answer
-
-    def _maybe_audit(self, stamp_ns: int) -> None:
-        if stamp_ns < self._next_audit_ns and self._next_audit_ns - stamp_ns <= self._settings.audit_period_ns:
-            return
-        if self.engine.odometry.last_keyframe < 0 or self.engine.graph.unsolved or self._auditing.busy():
-            return
-        self._next_audit_ns = stamp_ns + self._settings.audit_period_ns
-        if self.engine.boards.any_known():
-            self.engine.revisit()
-        self._auditing.begin(lambda: audit(self.engine))
-        self._take_audit()
-
-    def _take_audit(self) -> None:
-        """The audit's outcome, when it is there."""
-        try:
-            found = self._auditing.taken()
-        except SurecutError:
-            self.counts["audits_failed"] += 1
-            return
-        if found is not None:
-            self._audit, self._changed = found, True
 
     def _made(self, stamp_ns: int) -> Answer | None:
         engine, state = self.engine, self.engine.state
@@ -232,7 +211,7 @@ class GraphLoop:
         except ObservabilityError:
             self.counts["undetermined"] += 1
             return None
-        points = self._points(posterior)
+        points, consistency = self._points(posterior), self._audits.consistency()
         answer = Answer(
             stamp_ns=stamp_ns,
             keyframe_ns=engine.odometry.keyframe_stamps[-1] if newest else None,
@@ -243,8 +222,8 @@ class GraphLoop:
             calibration=departures(engine, posterior),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)[-EVENTS:]),
             last_tie_ns=engine.boards.last_seen_ns(),
-            consistent=self._audit.consistency.passed,
-            reasons=self._audit.consistency.reasons,
+            consistent=consistency.passed,
+            reasons=consistency.reasons,
         )
         self._forget_pictures()
         return replace(answer, decisions=self._decisions(answer, stamp_ns))
@@ -265,7 +244,7 @@ class GraphLoop:
             if not point.known or base not in posterior.columns or key not in posterior.columns:
                 continue
             position, blocks = point_blocks(posterior.values, base, key)
-            covariance = posterior.covariance(blocks) * self._audit.widening.get(point.id, 1.0)
+            covariance = posterior.covariance(blocks) * self._audits.widening(point.id)
             axis = self._axis(posterior, point.pipe) if point.on_axis else None
             found.append(
                 PointEstimate(
@@ -285,7 +264,7 @@ class GraphLoop:
     def _joint(self, posterior: Posterior, names: list[str]) -> Float:
         """Covariance of points in {b} together: they share machine, board and calibration."""
         rows: list[tuple[int, Float]] = []
-        wide = np.sqrt([self._audit.widening.get(name, 1.0) for name in names])
+        wide = np.sqrt([self._audits.widening(name) for name in names])
         for i, name in enumerate(names):
             key = keys.point(self.engine.pipes.points[name].index)
             for variable, block in point_blocks(posterior.values, keys.base(0), key)[1]:
@@ -327,7 +306,7 @@ class GraphLoop:
         start = PoseEstimate("m", "o", self._first_ns or now_ns, np.eye(4), None)
         result = Result(
             points=tuple(points), poses=(), trajectory=(start,), pipes=answer.pipes, calibration=(), distances=(),
-            consistency=self._audit.consistency, rejected=(), events=answer.events, streaming_difference_sigma={},
+            consistency=self._audits.consistency(), rejected=(), events=answer.events, streaming_difference_sigma={},
             timing={}, provenance={}, config_yaml="", last_board_view_ns=tie, end_ns=now_ns,
         )  # fmt: skip
         return decide(result, self.rig, self._validated)
@@ -337,6 +316,10 @@ class GraphLoop:
         for key in list(pictures)[:-PICTURES]:
             del pictures[key]
         del self.engine.picks[:-1000]
+
+    def _counted(self) -> dict[str, int]:
+        failed = {"audits_failed": self._audits.failed} if self._audits.failed else {}
+        return {**self.counts, **failed}
 
     # Memory ---------------------------------------------------------------------------------------------------
 
@@ -369,7 +352,7 @@ class GraphLoop:
 
     def close(self) -> None:
         """Ends what copies of the process still do."""
-        self._auditing.stop()
+        self._audits.stop()
         self._saving.stop()
 
     def _written(self) -> str:
