@@ -101,7 +101,8 @@ class BaseSearch:
         camera = engine.cameras.get("b_rgb")
         if view.colour is None or camera is None:
             return None
-        mapped = [self._mapped(v) for v in self._views]
+        known = [v for v in self._views if not engine.adrift.holds(keys.keyframe(v.keyframe))]
+        mapped = [self._mapped(v) for v in known]
         lens = engine.rig.cameras.b_rgb
         sigmas = lens.focal_sigma_rel, lens.centre_sigma_px
         found = find_view(mapped, features(view.colour, camera), camera, sigmas)

@@ -1,6 +1,6 @@
 """Boards in the graph: where a page starts from, its corners, side length and scale, and what contradicts the rig."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -44,6 +44,8 @@ class Boards:
         self.inspection = Inspection(rig, state, self._first.pinhole)
         self.news = BoardNews(rig)
         self.corners = CornerFactors(rig, state, self.news)
+        self.apart: Callable[[int, int], bool] = lambda key, other: False
+        """Is it unknown where two poses are against each other?"""
         self.insets: list[CalibrationEstimate] = []
         """After the run: how far the corners lie inside the true ones, by camera and board."""
 
@@ -64,6 +66,10 @@ class Boards:
 
     def lists_of_rejections(self) -> list[list[Rejection]]:
         return [self.news.refused, self.inspection.rejected]
+
+    def on_machine(self) -> list[int]:
+        """Keys of the poses of boards that move with the machine."""
+        return [s.key for s in self.sheets.values() if s.board.attached_to == "b"]
 
     def known(self, board: str) -> bool:
         """Has the board a pose in the graph?"""
@@ -215,6 +221,9 @@ class Boards:
         sheet.known = True
         held, sheet.held = sheet.held, []
         for key, earlier in held:
+            if self.apart(key, held[-1][0]):
+                self.news.refuse(sheet, earlier, "lost before the board was placed, views", 1.0, 2.0)
+                continue
             usable = [s for s in earlier if s.marker not in sheet.loose]
             self._observe(sheet, key, None, usable, update)
 

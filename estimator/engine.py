@@ -33,6 +33,7 @@ from .machine import Machine
 from .observability import why_no_base
 from .odometry import Odometry, OdometrySettings
 from .open_graph import OpenGraph
+from .open_views import OpenViews
 from .pipe_parts import SeenFrom
 from .pipes import Pipes
 from .placement import place, place_by_landmarks
@@ -44,7 +45,7 @@ corners of all of them."""
 
 WAITING_BUNDLES = 200
 """Frames without a known board that a run without end keeps."""
-WAITING_PICKS = 100
+UNPLACED = "the camera's place is unknown, places"
 
 
 class Engine:
@@ -74,7 +75,9 @@ class Engine:
         self.pipes = Pipes(rig, self.state)
         self.depth_pipes = DepthPipes(rig, self.state, self.pipes)
         self.adrift = Adrift(self.graph, self.odometry, self.boards)
+        self.odometry.foreign, self.boards.apart = self.adrift.foreign, self.adrift.apart
         self.surfaces = Surfaces(self.state, SurfaceSettings(), sigma, associate)
+        self.surfaces.loose = self.adrift.holds
         self.distances = KnownDistances(rig, self.state, self.boards)
         self.events: list[Event] = []
         self.machine = Machine(rig, self.graph, self.boards, self.surfaces, self.odometry, self.events)
@@ -89,8 +92,8 @@ class Engine:
         self.waiting: list[Bundle] = []
         """Frames that saw no known board, where there are no tracks."""
         self._forced = False
-        self.open_picks: list[tuple[Pick, tuple[float, float] | None]] = []
-        """Clicks in a camera that has no place at their stamp so far, with the depth under them."""
+        self.open_views = OpenViews()
+        """Clicks and outlines in a camera that has no place at their stamp so far."""
         self._unsolved = 0
         """Keyframes since the last update."""
         self.astray = False
@@ -104,13 +107,15 @@ class Engine:
         """Takes one stamp's measurements; True when the estimate has changed."""
         self.end_ns = max(self.end_ns, bundle.stamp_ns)
         if bundle.moved is not None:
+            before = self.base
             self.machine.move(bundle.moved)
+            self.adrift.include([self.base, *self.boards.on_machine()], before)
         self.graph.take(opened_calibration(self.state, self.rig, self.cameras, bundle))
         if bundle.frame is not None:
             self.odometry.follow(bundle.frame)
         if self._wants_keyframe(bundle):
             self._insert_keyframe(bundle)
-        if self.machine.see_boards([s for s in bundle.sightings if s.camera == "b_rgb"]):
+        if self.machine.see_boards(self._comparable([s for s in bundle.sightings if s.camera == "b_rgb"], self.base)):
             self._retry_picks()
         if bundle.cloud is not None:
             self.surfaces.see(bundle.cloud)
@@ -141,31 +146,33 @@ class Engine:
 
     def _insert_keyframe(self, bundle: Bundle) -> None:
         if bundle.frame is not None:
-            placed = self._relocalised(bundle) if self.astray else None
+            found = self.adrift.found
+            placed = self._relocalised(bundle) if self.astray else self.adrift.meet(bundle.frame, _mobile(bundle))
             if self.astray and placed is None:
                 return
             self.astray = False
             index = self.odometry.last_keyframe + 1
-            self.adrift.anchor(bundle.frame, _mobile(bundle))
-            before = frozenset(self.state.values.keys())
             update, rejected = self.odometry.insert(bundle.frame, placed)
             self.rejected += rejected
             self.graph.take(update)
-            self.adrift.begin(before, self.odometry.gap_s)
+            self.adrift.enter(update, bundle.frame)
         else:
             placed = self._place_by_markers(bundle)
             if placed is None:
                 return
-            index = placed
+            index, found = placed, self.adrift.found
         self.keyframe_at[bundle.stamp_ns] = index
         self._see_boards(keys.keyframe(index), bundle)
         if self.machine.enter_by_mount(bundle.stamp_ns):
+            self.adrift.include([self.base], self.boards.key(self.rig.mount.board) if self.rig.mount else -1)
             self._retry_picks()
         self.graph.take(self.distances.close(bundle.stamp_ns))
         self._unsolved += 1
         if bundle.frame is not None:
-            if self.adrift or self._unsolved >= self._together:
+            if self.adrift or self._unsolved >= self._together or self.adrift.found > found:
                 self.flush()
+            if self.adrift.found > found:
+                self._retry_picks()
             if not self.adrift:
                 self.machine.lay_landmarks(index)
 
@@ -188,6 +195,7 @@ class Engine:
             return False
         self.rejected += found[1]
         self.graph.take(found[0])
+        self.adrift.include(found[0].values.keys(), found[2])
         index = self.odometry.last_keyframe
         self.keyframe_at[bundle.stamp_ns] = index
         self._see_boards(keys.keyframe(index), bundle)
@@ -195,14 +203,25 @@ class Engine:
         return True
 
     def _see_boards(self, key: int, bundle: Bundle) -> None:
-        mobile = _mobile(bundle)
+        mobile = self._comparable(_mobile(bundle), key)
         if not mobile:
             return
         joint = None
         if bundle.frame is not None and self.boards.displaced(self._camera_poses(key), mobile):
             self.flush()
             joint = self.solver.joint_covariance
-        self.graph.take(self.boards.add(key, self._camera_poses(key), mobile, self._forced, joint))
+        update = self.boards.add(key, self._camera_poses(key), mobile, self._forced, joint)
+        self.graph.take(update)
+        self.adrift.include(update.values.keys(), key)
+
+    def _comparable(self, sightings: list[MarkerSighting], key: int) -> list[MarkerSighting]:
+        """Without boards of which it is unknown where they are against a pose: nothing may be concluded from them."""
+        if not self.adrift.strands:
+            return sightings
+        apart = {name for name, s in self.boards.sheets.items() if s.known and self.adrift.apart(s.key, key)}
+        for s in [s for s in sightings if s.board in apart]:
+            self.boards.news.refuse(self.boards.sheets[s.board], [s], UNPLACED, 0.0, 1.0)
+        return [s for s in sightings if s.board not in apart]
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
         o_T_m = self.state.pose(key)
@@ -285,9 +304,13 @@ class Engine:
                 return None
             return SeenFrom(base, self.state.pose(base).compose(self.state.pose(keys.extrinsics("b_rgb"))))
         index = self.keyframe_at.get(stamp_ns)
-        if index is None:
+        if index is None or self.loose(keys.keyframe(index)):
             return None
         return SeenFrom(keys.keyframe(index), self._camera_poses(keys.keyframe(index))[camera])
+
+    def loose(self, key: int) -> bool:
+        """Is a variable in a part of the map of which it is unknown where it is against {b}?"""
+        return self.adrift.holds(key) and self.adrift.apart(key, self.base)
 
     def take_picks(self, bundle: Bundle) -> None:
         """Clicks in a keyframe that is in the graph already."""
@@ -302,21 +325,29 @@ class Engine:
         self.picks.append(pick)
         where = self.seen_from(pick.camera, pick.stamp_ns)
         if where is None:
-            self.open_picks.append((pick, depth_m))
+            self.open_views.picks.append((pick, depth_m))
         else:
-            self.graph.take(self.pipes.pick(pick, where, depth_m))
+            self._hang(self.pipes.pick(pick, where, depth_m), where)
+
+    def _hang(self, update: Update, where: SeenFrom) -> None:
+        self.graph.take(update)
+        self.adrift.include(update.values.keys(), where.key)
 
     def _retry_picks(self) -> None:
-        """Picks whose camera had no place yet."""
-        waiting, self.open_picks = self.open_picks, []
-        for pick, depth_m in waiting:
+        """Picks and outlines whose camera had no place yet."""
+        waiting, self.open_views = self.open_views, OpenViews()
+        for pick, depth_m in waiting.picks:
             self._pick(pick, depth_m)
+        for outline in waiting.outlines:
+            self.add_outline(outline)
 
     def add_outline(self, outline: OutlineSighting) -> None:
         """Edges of a pipe in a keyframe's image; enters with the next update."""
         where = self.seen_from(outline.camera, outline.stamp_ns)
         if where is not None:
-            self.graph.take(self.pipes.outline(outline, where))
+            self._hang(self.pipes.outline(outline, where), where)
+        elif outline.stamp_ns in self.keyframe_at:
+            self.open_views.outlines.append(outline)
 
     def add_cylinder(self, pipe: str, base: int, found: CylinderSighting | Rejection) -> None:
         """A pipe in the Kinect's cloud of a station, or why it was not found; enters with the next update."""
@@ -325,7 +356,7 @@ class Engine:
 
     def lost_picks(self) -> list[Pick]:
         """Picks in cameras that have no place at their stamp."""
-        return [*(p for p, _ in self.open_picks), *(p for b in self.waiting for p in b.picks)]
+        return [*(p for p, _ in self.open_views.picks), *(p for b in self.waiting for p in b.picks)]
 
     def why_no_base(self) -> str:
         """The missing link between {o} and {b}, in words."""
@@ -351,6 +382,7 @@ class Engine:
         """Keys of keyframes on which measurements hang that have not entered the graph."""
         held = {key for sheet in self.boards.sheets.values() for key, _ in sheet.held}
         held |= {view.keyframe for sheet in self.boards.sheets.values() for view in sheet.displaced}
+        held |= {keys.keyframe(self.keyframe_at[at]) for at in self.open_views.stamps() if at in self.keyframe_at}
         return held | self.pipes.held_keyframes()
 
     def forget(self, gone: Collection[int]) -> None:
@@ -362,10 +394,10 @@ class Engine:
         self.surfaces.forget(landmarks)
         self.pipes.forget({k for k in gone if keys.kind(k) == "x"})
         self.waiting = self.waiting[-WAITING_BUNDLES:]
-        self.open_picks = self.open_picks[-WAITING_PICKS:]
+        self.open_views.shorten()
 
     def everything_told(self) -> list[Event]:
-        return [*self.events, *self.boards.events]
+        return [*self.events, *self.boards.events, *self.adrift.told()]
 
 
 def _mobile(bundle: Bundle) -> list[MarkerSighting]:

@@ -25,12 +25,15 @@ class LandmarkMap:
 
 
 def landmark_map(engine: Engine, fewest_views: int = FEWEST_VIEWS) -> LandmarkMap:
-    """Landmarks of {o} that were seen often enough to be points, with rough sigmas and where they were seen from."""
+    """Landmarks with a known place in {o} that were seen often enough to be points: rough sigmas, seen from where."""
     state, odometry = engine.state, engine.odometry
     tracks = [
         t
         for t, n in odometry.observations.items()
-        if n >= fewest_views and state.has(keys.landmark(t)) and state.has(keys.keyframe(odometry.seen_in[t]))
+        if n >= fewest_views
+        and state.has(keys.landmark(t))
+        and state.has(keys.keyframe(odometry.seen_in[t]))
+        and not engine.adrift.holds(keys.landmark(t))
     ]
     if not tracks:
         none = np.zeros((0, 3))

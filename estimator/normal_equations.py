@@ -133,7 +133,10 @@ class NormalEquations:
 
 
 def _independent(H: csr_matrix, owners: NDArray[np.uint64], widths: Int) -> NDArray[np.bool_]:
-    """Variables that may be eliminated block by block: landmarks, and keyframes that see no landmark and no other."""
+    """Variables that may be eliminated block by block: landmarks, and keyframes that see no landmark and no other.
+
+    What earlier keyframes left, or an earlier run, ties landmarks to each other: these are solved with the rest.
+    """
     kinds = np.array([keys.kind(int(k)) for k in owners])
     variable = np.repeat(np.arange(len(owners)), widths)
     upper = triu(H, format="coo")
@@ -145,4 +148,8 @@ def _independent(H: csr_matrix, owners: NDArray[np.uint64], widths: Int) -> NDAr
     tied = np.zeros(len(owners), bool)
     both = inner[a] & inner[b]
     tied[a[both]] = tied[b[both]] = True
-    return (kinds == "l") | ((kinds == "x") & ~tied)
+    landmark = kinds == "l"
+    both = landmark[a] & landmark[b]
+    joined = np.zeros(len(owners), bool)
+    joined[a[both]] = joined[b[both]] = True
+    return (landmark & ~joined) | ((kinds == "x") & ~tied)

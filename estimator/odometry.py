@@ -1,5 +1,6 @@
 """Stereo visual odometry in the graph: keyframes, and the landmarks that tie them together."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -13,6 +14,7 @@ from ..factors.measurements import Rejection, StereoFrame
 from ..factors.noise import gaussian, robust
 from ..factors.projection import mobile_projection
 from .graph import Record, State, Update
+from .spread import spread
 from .track_gate import FAMILY, Gate, Newest, TrackGate, residuals
 
 Float = NDArray[np.float64]
@@ -98,6 +100,8 @@ class Odometry:
         self._reference = -1
         """Keyframe that the front end's motion counts from: the newest but for those made after the fact."""
         self.gate = TrackGate(state, settings.gate)
+        self.foreign: Callable[[int, int | None], bool] = lambda key, keyframe: False
+        """Is it unknown where a landmark is, against a keyframe, or the frame that becomes one (None)?"""
 
     @property
     def last_keyframe(self) -> int:
@@ -112,6 +116,14 @@ class Odometry:
     def expected(self) -> gtsam.Pose3:
         """Where the frame just followed stands, by its motion since the last keyframe."""
         return self._guess_pose(len(self.keyframe_stamps))
+
+    def gap_of(self, frame: StereoFrame) -> float:
+        """Seconds that no track bridges, between the last keyframe and the frame just followed."""
+        if self._reference < 0 or not self._since_keyframe_lost:
+            return 0.0
+        # Up to the loss the front end has followed the motion; a frame or two more may have been poor already.
+        since = frame.stamp_ns - self.keyframe_stamps[self._reference]
+        return abs(min(since * 1e-9, (frame.stamp_ns - self._held_ns) * 1e-9 + POOR_S))
 
     def follow(self, frame: StereoFrame) -> None:
         """Moves the camera by the front end's estimate; every frame passes here once, in order."""
@@ -136,7 +148,7 @@ class Odometry:
         update.guess(key, pose)
         rejected: list[Rejection] = []
         self.gap_s = 0.0
-        known, new = self._split(frame)
+        known, new = self._split(frame, None)
         if index == 0:
             update.add(gauge_prior(key), Record("gauge", "gauge", frame.stamp_ns, "origin {o}", rejectable=False))
         else:
@@ -144,8 +156,8 @@ class Odometry:
             connected = self._reference >= 0 and self._state.has(keys.keyframe(self._reference))
             few = len(known) < self._settings.minimum_shared
             if connected and (self._since_keyframe_lost or few):
-                self._bridge(update, index, frame, pose, few)
-        for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
+                self._bridge(update, index, frame, few)
+        for row in spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self._create(update, frame, new, index, pose)
         if len(known) < self._settings.minimum_shared:
@@ -173,8 +185,9 @@ class Odometry:
         self.frames.append(FramePose(stamp_ns, index, np.eye(4)))
         self._reference = index
 
-    def insert_late(self, frame: StereoFrame) -> tuple[Update, list[Rejection]] | None:
-        """Makes a frame of the past a keyframe; None where its place is not known any more.
+    def insert_late(self, frame: StereoFrame) -> tuple[Update, list[Rejection], int] | None:
+        """Makes a frame of the past a keyframe, and tells the key of its neighbour; None where its place is not known
+        any more.
 
         Its tracks tie it to the map like any other keyframe's, but it makes no new landmarks: those that it saw first
         are in the map already, or have been found too poor.
@@ -186,14 +199,14 @@ class Odometry:
         pose = self._state.pose(keys.keyframe(past.keyframe)).compose(pose3(past.keyframe_T_this))
         update = Update()
         update.guess(keys.keyframe(index), pose)
-        known, _ = self._split(frame)
+        known, _ = self._split(frame, keys.keyframe(past.keyframe))
         known, rejected = self.gate.gated(frame, known, pose, self._newest())
         if len(known) < self._settings.minimum_shared:
             return None
-        for row in _spread(frame.left_px, known, self._settings.tracks_per_keyframe):
+        for row in spread(frame.left_px, known, self._settings.tracks_per_keyframe):
             self._observe(update, frame, row, index)
         self.keyframe_stamps.append(frame.stamp_ns)
-        return update, rejected
+        return update, rejected, keys.keyframe(past.keyframe)
 
     def _newest(self) -> Newest:
         return Newest(self._reference, self.seen_in, self._since_keyframe_lost)
@@ -204,28 +217,29 @@ class Odometry:
         previous = self._state.pose(keys.keyframe(self._reference))
         return previous.compose(pose3(self._keyframe_T_last))
 
-    def _split(self, frame: StereoFrame) -> tuple[list[int], list[int]]:
+    def _split(self, frame: StereoFrame, keyframe: int | None) -> tuple[list[int], list[int]]:
         """Rows of tracks that are landmarks already, and rows that may become ones."""
         known, new = [], []
         for row, track in enumerate(frame.track_ids):
-            if self._state.has(keys.landmark(int(track))):
-                known.append(row)
+            key = keys.landmark(int(track))
+            if self._state.has(key):
+                if not self.foreign(key, keyframe):
+                    known.append(row)
             elif np.isfinite(frame.right_px[row, 0]):
                 new.append(row)
         return known, new
 
-    def _bridge(self, update: Update, index: int, frame: StereoFrame, pose: gtsam.Pose3, few: bool) -> None:
+    def _bridge(self, update: Update, index: int, frame: StereoFrame, few: bool) -> None:
         """Joins a keyframe that the map does not hold by a motion prior."""
         earlier = keys.keyframe(self._reference)
         seconds = (frame.stamp_ns - self.keyframe_stamps[self._reference]) * 1e-9
         if self._since_keyframe_lost:
-            # Up to the loss the front end has followed the motion; a frame or two more may have been poor already.
-            seconds = min(seconds, (frame.stamp_ns - self._held_ns) * 1e-9 + POOR_S)
+            seconds = self.gap_of(frame)
             self.gap_s = seconds if few else 0.0
-        motion = self._state.pose(earlier).between(pose)
         settings = self._settings
         turn_rad_s = settings.lost_turn_rad_s if self._since_keyframe_lost else settings.poor_turn_rad_s
-        factor = motion_prior(earlier, keys.keyframe(index), motion, abs(seconds), settings.lost_speed_m_s, turn_rad_s)
+        motion, later = pose3(self._keyframe_T_last), keys.keyframe(index)
+        factor = motion_prior(earlier, later, motion, abs(seconds), settings.lost_speed_m_s, turn_rad_s)
         what = f"motion over {seconds:.2f} s without enough shared landmarks"
         update.add(factor, Record(FAMILY, "motion prior", frame.stamp_ns, what, rejectable=False))
 
@@ -247,7 +261,7 @@ class Odometry:
         """New landmarks from tracks seen in an earlier keyframe too; others wait for their second one."""
         room = self._settings.tracks_per_keyframe
         ready = [r for r in rows if int(frame.track_ids[r]) in self._waiting]
-        ready = _spread(frame.left_px, ready, room)
+        ready = spread(frame.left_px, ready, room)
         points = self._triangulate(frame, ready)
         agree = self._agreeing(frame, ready, points, pose)
         for r, c_p in zip(ready, points, strict=True):
@@ -293,7 +307,7 @@ class Odometry:
         distance = np.linalg.norm(residual - np.median(residual, axis=0), axis=1)
         limit = max(self._settings.gate.sigma * 1.4826 * float(np.median(distance)), self._settings.gate.px)
         good = [i for i in range(len(rows)) if front[i] and distance[i] < limit]
-        chosen = set(_spread(frame.left_px, [rows[i] for i in good], self._settings.tracks_per_keyframe))
+        chosen = set(spread(frame.left_px, [rows[i] for i in good], self._settings.tracks_per_keyframe))
         for r, o_p in made:
             if r in chosen:
                 track = int(frame.track_ids[r])
@@ -370,20 +384,3 @@ class Odometry:
 def _rays(px: Float, K: Float) -> Float:
     """Directions with z = 1, shape (n, 3)."""
     return np.stack([(px[:, 0] - K[0, 2]) / K[0, 0], (px[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(px))], axis=1)
-
-
-def _spread(px: Float, rows: list[int], count: int) -> list[int]:
-    """At most `count` rows, taken round robin from the cells of a coarse grid, so that they cover the image."""
-    if len(rows) <= count:
-        return rows
-    cell = 1 + np.ptp(px[rows], axis=0) / 6
-    bins: dict[tuple[int, int], list[int]] = {}
-    for r in rows:
-        u, v = (px[r] // cell).astype(int)
-        bins.setdefault((int(u), int(v)), []).append(r)
-    chosen: list[int] = []
-    while len(chosen) < count:
-        for members in bins.values():
-            if members and len(chosen) < count:
-                chosen.append(members.pop(0))
-    return chosen

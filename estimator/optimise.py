@@ -87,6 +87,7 @@ def optimise(
                 report.sensing.rejected,
                 odd,
                 memory=True,
+                apart=processes > 1,
             )
 
 

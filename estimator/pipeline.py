@@ -115,8 +115,11 @@ class Pipeline:
     def _check_open_picks(self) -> None:
         """A point all of whose picks hang on nothing."""
         for pick in self.engine.lost_picks():
-            if pick.point_id in self.engine.pipes.points or not self.engine.odometry.keyframe_stamps:
+            engine = self.engine
+            if pick.point_id in engine.pipes.points or not engine.odometry.keyframe_stamps:
                 continue
+            if pick.stamp_ns in engine.keyframe_at and pick.camera != "b_rgb":
+                continue  # made while the camera was lost, which the result says
             where = f"{self.rig.picks_topic} at {pick.stamp_ns} ns: pick {pick.point_id} in {pick.camera}"
             if pick.camera == "b_rgb":
                 raise ObservabilityError(f"{where}: {self.engine.why_no_base()}")

@@ -2,7 +2,7 @@
 
 from ..factors import keys
 from ..factors.measurements import Rejection
-from .engine import Engine
+from .engine import UNPLACED, Engine
 from .odometry import FAMILY as ODOMETRY
 
 
@@ -38,5 +38,7 @@ def _waited_in_vain(engine: Engine) -> list[Rejection]:
         waiting.append(Rejection(bundle.stamp_ns, "marker corners", what, "no known board; boards", 0.0, 1.0))
     for pick in engine.lost_picks():
         what = f"pick {pick.point_id} in {pick.camera}"
-        waiting.append(Rejection(pick.stamp_ns, "picks", what, "no frame of its stamp, frames", 0.0, 1.0))
+        lost = pick.camera != "b_rgb" and pick.stamp_ns in engine.keyframe_at
+        reason = UNPLACED if lost else "no frame of its stamp, frames"
+        waiting.append(Rejection(pick.stamp_ns, "picks", what, reason, 0.0, 1.0))
     return waiting

@@ -1,7 +1,7 @@
 """Measurements to result: the one loop, its end, and the batch refinement."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from functools import partial
 
 from ..factors.camera import CameraModel
 from ..factors.errors import ObservabilityError
@@ -44,11 +44,13 @@ def finish(
     rejected: Sequence[Rejection] = (),
     events: Sequence[Event] = (),
     memory: bool = False,
+    apart: bool = False,
 ) -> Result:
     """Settles iSAM2, refines in batch over the same factors, and reads the result.
 
     Args:
         memory: a later run may begin with the result.
+        apart: copies of the process do a part of the work, where a second core is free.
 
     Raises:
         ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
@@ -57,8 +59,9 @@ def finish(
     engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events
-    result = Summary(engine, solution).result(between, dict(timing or {}), dict(provenance or {}))
-    return replace(result, memory=_memory(engine, solution)) if memory else result
+    summary = Summary(engine, solution, apart)
+    remembered = partial(_memory, engine, solution) if memory else str
+    return summary.result(between, dict(timing or {}), dict(provenance or {}), remembered)
 
 
 def _memory(engine: Engine, solution: BatchSolution) -> str:

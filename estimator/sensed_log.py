@@ -1,88 +1,62 @@
-"""A recording as the front ends see it: read in this process, or in one of its own while the graph is being solved.
+"""A recording as the front ends see it: read in this process, or in two of their own while the graph is being solved.
 
-The front ends' libraries take a second to load. They are imported where they run, so that the other process can start
-before this one has loaded the graph's.
+```
+[reader, tracking] ──> [markers, surfaces, clicks] ──> graph
+```
+
+Where that is safe the two are copies (forks) of this process: what has been loaded is there at once, and the first
+begins before the graph's libraries are loaded.
 """
 
+import importlib
 import multiprocessing
 import queue
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
 
 from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
+from .sensed_here import RecordingReport, SensedHere, SensedLog
 from .threads import single_threaded_children
 
 if TYPE_CHECKING:
-    from .sensing import Sensed, SensingReport
+    from ..factors.measurements import StereoFrame
+    from ..frontends.stereo.atlas import Memorable
+    from .items import Item
+    from .sensing import Sensed
 
 AHEAD = 64
-"""Stamps that the front ends may be ahead of the graph: what bounds the memory."""
+"""Stamps that each process may be ahead of the next: what bounds the memory."""
 POLL_S = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingReport:
-    """What can be said of a recording once it has been read."""
-
-    sensing: "SensingReport"
-    warnings: tuple[str, ...] = ()
-    """Damage, one line each."""
-    sha256: str = ""
-
-    @classmethod
-    def empty(cls) -> "RecordingReport":
-        """Of a recording of which nothing has been read."""
-        from .sensing import SensingReport
-
-        return cls(SensingReport())
-
-
-class SensedLog(Protocol):
-    """What is seen in a recording, stamp by stamp; the report is complete after the last."""
-
-    @property
-    def report(self) -> RecordingReport: ...
-
-    def __iter__(self) -> Iterator["Sensed"]: ...
+SHARED_SIZE = 256
+"""Rows of a matrix whose products are shared among threads, if there are any."""
 
 
 def opened(log: Path, rig: Rig, processes: int = 1) -> "AbstractContextManager[SensedLog]":
-    """A recording and its front ends, in this process or, with two, in one of their own."""
+    """A recording and its front ends, in this process or, with two, beside it."""
     return SensedElsewhere(log, rig) if processes > 1 else SensedHere(log, rig)
 
 
-class SensedHere:
-    """Front ends in this process."""
+@dataclass(frozen=True, slots=True)
+class _Followed:
+    """How the mobile camera moved, and what of the messages of one stamp is still of use."""
 
-    def __init__(self, log: Path, rig: Rig) -> None:
-        from .items import wanted_topics
-        from .sensing import Sensing
-
-        self._reader = LogReader(log, wanted_topics(rig))
-        self._sensing = Sensing(rig)
-        self._sha256 = ""
-
-    @property
-    def report(self) -> RecordingReport:
-        return RecordingReport(self._sensing.report(), tuple(self._reader.warnings), self._sha256)
-
-    def __iter__(self) -> Iterator["Sensed"]:
-        yield from self._sensing.run(self._reader)
-        self._sha256 = self._reader.sha256()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self._reader.close()
+    stamp_ns: int
+    items: "list[Item]"
+    frame: "StereoFrame | None"
+    warnings: tuple[str, ...]
+    """What has been found wrong with the recording so far."""
+    memorable: "Memorable | None" = None
+    """What the frame added to what can be found again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,37 +70,46 @@ class _End:
 
 
 class SensedElsewhere:
-    """Front ends in a process of their own, a bounded number of stamps ahead."""
+    """Front ends in processes of their own, a bounded number of stamps ahead."""
 
     def __init__(self, log: Path, rig: Rig) -> None:
         self._report: RecordingReport | None = None
         self._log, self._rig = log, rig
-        self._process: BaseProcess | None = None
-        self._queue: Any = None
+        self._processes: list[BaseProcess] = []
+        self._context: Any = None
+        self._followed: Any = None
+        self._sensed: Any = None
 
     @property
     def report(self) -> RecordingReport:
         return self._report or RecordingReport.empty()
 
     def __enter__(self) -> Self:
-        context = multiprocessing.get_context("spawn")
-        self._queue = context.Queue(AHEAD)
-        self._process = context.Process(target=_sense, args=(self._log, self._rig, self._queue), daemon=True)
-        with single_threaded_children():
-            self._process.start()
+        forks = may_fork()
+        self._context = multiprocessing.get_context("fork" if forks else "spawn")
+        self._followed, self._sensed = self._context.Queue(AHEAD), self._context.Queue(AHEAD)
+        if forks:
+            importlib.import_module(".sensing", __package__)  # here, for all processes
+        self._start(_follow, self._log, self._rig, self._followed)
+        if not forks:
+            self._start(_look, self._rig, self._followed, self._sensed)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        if self._process is not None:
-            self._process.terminate()
-            self._process.join()
-            self._queue.close()
+        for process in self._processes:
+            process.terminate()
+        for process in self._processes:
+            process.join()
+        self._followed.close()
+        self._sensed.close()
 
     def __iter__(self) -> Iterator["Sensed"]:
         """
         Raises:
-            SurecutError: what the front ends found wrong, or their process was killed.
+            SurecutError: what the front ends found wrong, or one of their processes was killed.
         """
+        if len(self._processes) == 1:  # this copy needs what the graph has loaded by now
+            self._start(_look, self._rig, self._followed, self._sensed)
         while not isinstance(item := self._next(), _End):
             yield item
         self._report = item.report
@@ -135,30 +118,83 @@ class SensedElsewhere:
         if item.defect is not None:
             raise RuntimeError(item.defect)
 
+    def _start(self, work: Callable[..., None], *given: object) -> None:
+        process = self._context.Process(target=work, args=given, daemon=True)
+        with single_threaded_children():
+            process.start()
+        self._processes.append(process)
+
     def _next(self) -> "Sensed | _End":
-        assert self._process is not None
         while True:
             try:
-                return self._queue.get(timeout=POLL_S)
+                return self._sensed.get(timeout=POLL_S)
             except queue.Empty:
-                if not self._process.is_alive() and self._queue.empty():
+                dead = next((p.exitcode for p in self._processes if p.exitcode), None)
+                if dead is not None and self._sensed.empty():
                     raise SurecutError(
-                        f"{self._log}: the process that reads it was killed (exit code {self._process.exitcode}); "
-                        "is there enough memory?"
+                        f"{self._log}: the process that reads it was killed (exit code {dead}); is there enough memory?"
                     ) from None
 
 
-def _sense(log: Path, rig: Rig, out: Any) -> None:
-    """The process: reads, senses, and hands over what it saw or what went wrong."""
+def may_fork() -> bool:
+    """Is a copy of this process safe? It has none of the threads, and whatever these have locked stays locked."""
+    tasks = Path("/proc/self/task")
+    if "fork" not in multiprocessing.get_all_start_methods() or not tasks.is_dir():
+        return False
+    work = np.ones((SHARED_SIZE, SHARED_SIZE))
+    np.linalg.norm(work @ work)  # where NumPy has threads for this, they are there now
+    return len([*tasks.iterdir()]) == 1
+
+
+def _follow(log: Path, rig: Rig, out: Any) -> None:
+    """The first process: reads, and follows the mobile camera."""
+    from .items import wanted_topics
+    from .sensing import Sensing
+
+    _prepare()
+    reader, sensing = LogReader(log, wanted_topics(rig)), Sensing(rig)
+
+    def report() -> RecordingReport:
+        return RecordingReport(sensing.report(), tuple(reader.warnings))
+
+    try:
+        for group in sensing.groups(reader):
+            frame = sensing.follow(group)
+            needed, memorable = sensing.needed(group, frame), sensing.memorable(frame)
+            out.put(_Followed(group[0].stamp_ns, needed, frame, tuple(reader.warnings), memorable))
+        out.put(_End(replace(report(), sha256=reader.sha256())))
+    except SurecutError as error:
+        out.put(_End(report(), error))
+    except Exception:
+        out.put(_End(report(), defect=traceback.format_exc()))
+
+
+def _look(rig: Rig, followed: Any, out: Any) -> None:
+    """The second process: everything else that can be seen."""
+    from .sensing import Sensing, SensingReport
+
+    _prepare()
+    sensing, warnings = Sensing(rig), ()
+
+    def report(of: RecordingReport) -> RecordingReport:
+        own = sensing.report()
+        return replace(of, sensing=replace(of.sensing, rejected=own.rejected, depths=own.depths))
+
+    try:
+        while not isinstance(item := followed.get(), _End):
+            warnings = item.warnings
+            out.put(sensing.look(item.items, item.frame, item.stamp_ns, item.memorable))
+        out.put(replace(item, report=report(item.report)))
+    except SurecutError as error:
+        out.put(_End(report(RecordingReport(SensingReport(), warnings)), error))
+    except Exception:
+        out.put(_End(report(RecordingReport(SensingReport(), warnings)), defect=traceback.format_exc()))
+
+
+def _prepare() -> None:
     import cv2
 
-    cv2.setNumThreads(1)  # the graph has the other core
-    here = SensedHere(log, rig)
-    try:
-        for sensed in here:
-            out.put(sensed)
-        out.put(_End(here.report))
-    except SurecutError as error:
-        out.put(_End(here.report, error))
-    except Exception:
-        out.put(_End(here.report, defect=traceback.format_exc()))
+    from .stream.parent import end_with_parent
+
+    cv2.setNumThreads(1)  # the cores are shared with the others
+    end_with_parent()

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeGuard
+from typing import TYPE_CHECKING, TypeGuard
 
 import cv2
 import numpy as np
@@ -19,10 +19,12 @@ from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, 
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
 from .bundle import Bundle
-from .depth_sensor import DepthView
 from .items import COLOUR_PERIOD_NS, Item, plain
 from .sensors import PairImages, Sensors, by_info_topic
 from .sides import Sides
+
+if TYPE_CHECKING:
+    from .depth_sensor import DepthView
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,7 @@ class Sensed:
     """What the front ends make of all messages of one stamp. Plain data: it may cross a process border."""
 
     bundle: Bundle
-    depth: DepthView | None = None
+    depth: "DepthView | None" = None
     """What the Kinect saw, when enough depth images have gathered."""
     pair: PairImages | None = None
     """The pictures, where the pair is a keyframe or was clicked in."""
@@ -76,6 +78,10 @@ class Sensing:
         """Cameras whose calibration has been handed on."""
         self._started = False
         """The first pair is a keyframe whatever it shows."""
+        self._any_needed = False
+        """The same, of what `needed` has let pass."""
+        self._needed_cameras: dict[str, CameraModel] = {}
+        """The last calibrations that it has let pass, as the decoder gave them: mostly the very same object."""
         self._depths_seen = 0
         self._last_colour_ns: int | None = None
         self._colour: ImageBody | None = None
@@ -95,7 +101,7 @@ class Sensing:
     def process(self, group: list[Item]) -> Sensed:
         """All messages of one stamp."""
         frame = self.follow(group)
-        return self.look(group, frame, self.memorable(frame))
+        return self.look(self.needed(group, frame), frame, group[0].stamp_ns, self.memorable(frame))
 
     def follow(self, group: list[Item], early: Early | None = None) -> StereoFrame | None:
         """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
@@ -108,24 +114,46 @@ class Sensing:
         """
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
-        clicked = any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
-        return self.sensors.track(pair, clicked, early) if pair is not None else None
+        return self.sensors.track(pair, _clicked(group), early) if pair is not None else None
 
     def memorable(self, frame: StereoFrame | None) -> Memorable | None:
         """What the frame that was followed last added to what can be found again."""
         return None if frame is None else self.sensors.memorable()
 
-    def look(self, group: list[Item], frame: StereoFrame | None, memorable: Memorable | None = None) -> Sensed:
+    def needed(self, group: list[Item], frame: StereoFrame | None) -> list[Item]:
+        """What `look` needs of a group that has been followed: most pictures and calibrations tell it nothing new."""
+        first, self._any_needed = not self._any_needed, self._any_needed or frame is not None
+        shown = frame is None or frame.is_keyframe or first or _clicked(group)
+        return [item for item in group if (shown or not isinstance(item, StereoPair)) and not self._known_before(item)]
+
+    def _known_before(self, item: Item) -> bool:
+        """Is it the calibration that a camera had already?"""
+        if not self.is_calibration(item) or not isinstance(item.body, CameraInfoBody):
+            return False
+        camera, model = self._info[item.topic], item.body.camera
+        known = self._needed_cameras.get(camera) is model
+        self._needed_cameras[camera] = model
+        return known
+
+    def look(
+        self,
+        group: list[Item],
+        frame: StereoFrame | None,
+        stamp_ns: int | None = None,
+        memorable: Memorable | None = None,
+    ) -> Sensed:
         """Everything else that a group shows.
 
         Args:
+            group: whole, or what is `needed` of it.
             frame: what `follow`, of this object or another, has said of the pair.
-            memorable: and what it added to what can be found again.
+            stamp_ns: the group's, where nothing of it may be left.
+            memorable: what the frame added to what can be found again.
 
         Raises:
             LogError: a part of it cannot be used.
         """
-        stamp_ns = _stamp(group[0])
+        stamp_ns = _stamp(group[0]) if stamp_ns is None else stamp_ns
         self.calibrate(group)
         pair = None
         if frame is not None:
@@ -213,7 +241,7 @@ class Sensing:
             self._last_colour_ns = stamp_ns
         return due
 
-    def _depth(self, stamp_ns: int, group: list[Item]) -> DepthView | None:
+    def _depth(self, stamp_ns: int, group: list[Item]) -> "DepthView | None":
         view, kinect = None, self.sensors.kinect
         for item in group:
             if not isinstance(item, Message):
@@ -251,6 +279,10 @@ def _atlas_of(memorable: Memorable) -> Atlas:
     """With the view described."""
     view = memorable.view
     return Atlas(() if view is None else (place_of(view),), memorable.tracks)
+
+
+def _clicked(group: list[Item]) -> bool:
+    return any(isinstance(i, Message) and isinstance(i.body, PickBody) for i in group)
 
 
 def images(pair: StereoPair) -> PairImages:

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import cast
+from functools import cached_property
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,10 @@ from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early, StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
-from .depth_sensor import DepthSensor, DepthView
 from .sides import swapped
+
+if TYPE_CHECKING:
+    from .depth_sensor import DepthSensor, DepthView
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -65,7 +68,6 @@ class Sensors:
         """The last calibration that came, as the decoder gave it: mostly the very same object."""
         self._stereo: StereoFrontEnd | None = None
         self._markers: dict[str, MarkerFrontEnd] = {}
-        self.kinect = DepthSensor(rig.kinect)
         self._unmatched = 0
         """Pairs from the start on that had hardly a feature in common."""
         self.rejected: list[Rejection] = []
@@ -194,7 +196,15 @@ class Sensors:
 
     # Kinect ---------------------------------------------------------------------------------------------------
 
-    def depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> DepthView | None:
+    @cached_property
+    def kinect(self) -> "DepthSensor":
+        from .depth_sensor import (
+            DepthSensor,
+        )  # with libraries that who only follows the mobile camera need not wait for
+
+        return DepthSensor(self.rig.kinect)
+
+    def depth(self, stamp_ns: int, depth_m: NDArray[np.float32]) -> "DepthView | None":
         """The last depth images, once enough have gathered."""
         camera = self._camera("b_depth")
         self._fits(camera, cast(Grey, depth_m), self.rig.cameras.b_depth.image_topic)

@@ -1,6 +1,7 @@
 """From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -15,6 +16,7 @@ from ..factors.rig import dump_rig
 from . import dark_uncertainty
 from .advice import advise
 from .agreement import cloud_event
+from .aside import Aside
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
 from .calibration_rows import calibration_rows
@@ -32,6 +34,8 @@ from .result import (
     Advice,
     Consistency,
     DistanceEstimate,
+    MotionEstimate,
+    PickView,
     PipeEstimate,
     PointEstimate,
     PoseEstimate,
@@ -45,47 +49,91 @@ LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder",
 """Families without each of which there may still be an estimate to compare with."""
 
 
-class Summary:
-    """Reads one solution. Every covariance comes from the same linear system."""
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """Parts of a result that need no other but the points."""
 
-    def __init__(self, engine: Engine, solution: BatchSolution) -> None:
+    advice: dict[str, tuple[Advice, ...]]
+    pick_views: tuple[PickView, ...]
+    motions: tuple[MotionEstimate, ...]
+    streaming_difference_sigma: dict[str, float]
+    memory: str
+
+
+class Summary:
+    """Reads one solution. Every covariance comes from the same linear system.
+
+    Args:
+        apart: a copy of the process reads a part of it, where a second core is free.
+    """
+
+    def __init__(self, engine: Engine, solution: BatchSolution, apart: bool = False) -> None:
         self._engine = engine
+        self._apart = apart
         self._values = solution.values
         self._solution = solution
         self._active, self._system = solution.at.active, solution.at.system
 
     def result(
-        self, between: tuple[tuple[str, str], ...], timing: dict[str, float], provenance: dict[str, str]
+        self,
+        between: tuple[tuple[str, str], ...],
+        timing: dict[str, float],
+        provenance: dict[str, str],
+        memory: Callable[[], str] = str,
     ) -> Result:
+        """
+        Args:
+            memory: makes the text from which a later run may begin.
+        """
         engine = self._engine
-        consistency = self._consistency()
         points = self._points()
-        distances = self._distances(between)
-        self._tell_corner_rms()
         pipes = self._pipes(points)
         around = surroundings(engine, self._values, self._system)
         points = tuple(self._with_surface(p, pipes, around) for p in points)
+        rest: Aside[_Rest] = Aside(self._apart, niceness=0)
+        rest.begin(lambda: self._rest(points, memory))
+        try:
+            consistency = self._consistency()
+            distances = self._distances(between)
+            self._tell_corner_rms()
+            poses = self._poses()
+            path = trajectory(engine.odometry, self._values, self._keyframe_covariances())
+            calibration = calibration_rows(engine, self._values, self._sigmas)
+            other = rest.awaited()
+        finally:
+            rest.stop()
         return Result(
             points=points,
-            poses=self._poses(),
-            trajectory=trajectory(engine.odometry, self._values, self._keyframe_covariances()),
+            poses=poses,
+            trajectory=path,
             pipes=pipes,
-            calibration=calibration_rows(engine, self._values, self._sigmas),
+            calibration=calibration,
             distances=distances,
             consistency=consistency,
             rejected=(*everything_rejected(engine), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
-            streaming_difference_sigma=self._streaming_difference(),
+            streaming_difference_sigma=other.streaming_difference_sigma,
             timing=timing,
             provenance=provenance,
             config_yaml=dump_rig(engine.rig),
             last_board_view_ns=engine.boards.last_seen_ns(),
             end_ns=engine.end_ns,
-            advice=self._advice(points),
-            pick_views=pick_views(engine, self._values, self._system),
+            advice=other.advice,
+            pick_views=other.pick_views,
             picks=pick_records(engine),
             surroundings=compact_map(around),
-            motions=motions(self._values, self._system, engine.odometry.keyframe_stamps),
+            motions=other.motions,
+            memory=other.memory,
+        )
+
+    def _rest(self, points: tuple[PointEstimate, ...], memory: Callable[[], str]) -> "_Rest":
+        """What changes nothing and is told to nobody before the end."""
+        return _Rest(
+            self._advice(points),
+            pick_views(self._engine, self._values, self._system),
+            motions(self._values, self._system, self._engine.odometry.keyframe_stamps),
+            self._streaming_difference(),
+            memory(),
         )
 
     def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:

@@ -1,5 +1,6 @@
 """The Kinect's surfaces in the graph: landmarks of the mobile camera lie on planes that the Kinect measured."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -61,6 +62,8 @@ class Surfaces:
         self._settings = settings
         self._robust_sigma = robust_sigma
         self._associate = associate
+        self.loose: Callable[[int], bool] = lambda key: False
+        """Is it unknown where a landmark is?"""
         self.cloud: CloudFrame | None = None
         self._tried: dict[int, int] = {}
         self._laid: set[int] = set()
@@ -133,7 +136,7 @@ class Surfaces:
             due = self._tried.get(track, 0)
             if track in self._laid or count < max(self._settings.minimum_views, due):
                 continue
-            if self._state.has(keys.landmark(track)):
+            if self._state.has(keys.landmark(track)) and not self.loose(keys.landmark(track)):
                 self._tried[track] = count + self._settings.retry_keyframes
                 rows.append(track)
         return rows

@@ -35,6 +35,18 @@ def problem(landmarks: int, keyframes: int, chain: bool):
     return graph, values
 
 
+def test_landmarks_that_know_of_each_other():
+    """As those do that a joint prior of an earlier part of a run holds."""
+    graph, values = problem(12, 4, True)
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, 0.001)
+    for a, b in ((0, 1), (1, 2), (0, 5)):
+        one, other = keys.landmark(3 * a), keys.landmark(3 * b)
+        graph.add(gtsam.BetweenFactorPoint3(one, other, values.atPoint3(other) - values.atPoint3(one), tight))
+    system = LinearSystem(graph, values)
+    covariance = np.linalg.inv((system.A.T @ system.A).toarray())
+    np.testing.assert_allclose(system.solve(np.eye(system.parameters)), covariance, rtol=1e-6, atol=1e-10)
+
+
 @pytest.mark.parametrize(
     ("landmarks", "keyframes", "chain"), [(0, 5, False), (0, 5, True), (12, 4, False), (12, 4, True)]
 )

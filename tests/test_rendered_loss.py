@@ -1,4 +1,4 @@
-"""Total loss of view on rendered pixels: a turn that no track survives, then darkness; see `-m campaign`."""
+"""Total loss of view on rendered pixels: a turn that no track survives, darkness, a strange view; `-m campaign`."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,21 @@ AWAY_S, BACK_S = 8.0, 11.5
 SMALLER = {"mobile": {"rate_hz": 10}, "kinect": {"rate_hz": 1, "width": 320, "height": 240, "depth_focal_px": 292.5}}
 
 
-@pytest.fixture(scope="module")
-def estimated(tmp_path_factory):
-    log = tmp_path_factory.mktemp("rendered") / "whirl.mcap"
-    (scenario,) = load_scenarios("whirl")
+def run(folder, name):
+    log = folder / f"{name}.mcap"
+    (scenario,) = load_scenarios(name)
     simulate(log, override(scenario, SMALLER), 5, workers=1)
     return optimise(log), truth_of_log(log)
+
+
+@pytest.fixture(scope="module")
+def estimated(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("rendered"), "whirl")
+
+
+@pytest.fixture(scope="module")
+def lost_twice(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("rendered"), "strange")
 
 
 def errors(result, truth, seconds):
@@ -62,3 +71,27 @@ def test_what_lies_between_is_known_to_be_uncertain(estimated):
         if pose.covariance is not None and pose.stamp_ns in true and AWAY_S < seconds < BACK_S:
             assert pose_quantity("trajectory", "m", pose.matrix, pose.covariance, true[pose.stamp_ns]).nees < 30.0
     assert max(quantity.nees for quantity in motion_quantities(result.motions, truth)) < 30.0
+
+
+def test_a_strange_view_between_two_losses_harms_nothing(lost_twice):
+    """Only the page, at the end, shows where the camera has been since the second loss."""
+    result, truth = lost_twice
+    after = errors(result, truth, (8.6, 1e3))
+    assert len(after) > 200
+    assert after[:, 0].max() < 0.03
+    assert after[:, 1].max() < 0.6
+    assert result.points
+    for point in result.points:
+        assert np.linalg.norm(point.position_m - truth.points_b_m[point.id]) < 0.025
+    assert max(quantity.nees for quantity in motion_quantities(result.motions, truth)) < 30.0
+    assert result.consistency.passed
+    assert [e.kind for e in result.events if e.severity != "info"] == ["sight_lost"]
+
+
+def test_the_strange_view_is_known_to_be_anywhere(lost_twice):
+    result, truth = lost_twice
+    true = dict(zip(truth.stamps_ns, truth.o_T_m, strict=True))
+    strange = [p for p in result.trajectory if 5.0e9 < p.stamp_ns - min(true) < 7.0e9 and p.covariance is not None]
+    assert strange
+    for pose in strange:
+        assert pose_quantity("trajectory", "m", pose.matrix, pose.covariance, true[pose.stamp_ns]).nees < 30.0

@@ -328,7 +328,7 @@ def test_a_loop_is_closed_after_a_drift(rendered):
     first = run([pairs[i] for i in order[:45]], front=front)
     before = {i for frame in first[:25] for i in frame.track_ids.tolist()}
     front._chain_T_keyframe = front._chain_T_keyframe @ exponential(np.array([0.0, 0.09, 0.0, 0.3, 0.1, -0.25]))
-    front.places._places = [place for place in front.places._places if place.stamp_ns < 40 * STEP_NS]
+    front.finding.places._places = [place for place in front.finding.places._places if place.stamp_ns < 40 * STEP_NS]
     rng = np.random.default_rng(8)
     again = [
         front.process(i * STEP_NS, expose(pairs[order[i]][0], rng), expose(pairs[order[i]][1], rng))

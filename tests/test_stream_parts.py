@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from stream_messages import LEFT, MS, RIG, RIGHT, START, image
 
+from surecut.estimator.aside import Aside
 from surecut.estimator.decision import Decision
 from surecut.estimator.observability import Undetermined
-from surecut.estimator.stream.aside import Aside
 from surecut.estimator.stream.follower import Follower
 from surecut.estimator.stream.ordering import LiveOrder
 from surecut.estimator.stream.settings import StreamSettings

@@ -149,10 +149,11 @@ def _write(job: Job, result: Result) -> None:
     for path in (job.output, job.json, job.tum):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
+    text = to_json(result) if job.output is not None or job.json is not None else ""
     if job.output is not None:
-        write_result(job.output, result)
+        write_result(job.output, result, text)
     if job.json is not None:
-        write_text(job.json, to_json(result))
+        write_text(job.json, text)
     if job.tum is not None:
         write_text(job.tum, tum_text(result, job.frame))
 
@@ -167,15 +168,18 @@ def _with_progress(job: Job) -> Result:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(job.log.name, total=None)
-        start, length = _time_range(job.log)
-        bar.update(task, total=length)
+    start, length = _time_range(job.log)
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task(job.log.name, total=length)
 
-        def advance(stamp_ns: int) -> None:
-            bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
+    def advance(stamp_ns: int) -> None:
+        bar.start()  # the bar has a thread, without which the front ends can be copies of this process
+        bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
+    try:
         result = optimise(job.log, job.rig, job.between, advance, job.command, processes=PROCESSES)
+    finally:
+        bar.stop()
     _write(job, result)
     return result
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from ...factors.errors import SurecutError
+from ..aside import Aside
 from ..engine import Engine
 from ..result import Consistency
-from .aside import Aside
 from .audit import Audit, audit
 from .settings import S
 

@@ -13,6 +13,7 @@ from ...factors import keys
 from ...factors.errors import ObservabilityError, SurecutError
 from ...factors.measurements import Pick
 from ...factors.rig import Rig, sha256_of
+from ..aside import Aside
 from ..bounded import Bounded
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
@@ -20,7 +21,6 @@ from ..points_in_base import pipe_estimate, point_blocks, radius95
 from ..result import PipeEstimate, PointEstimate, PoseEstimate, Result
 from ..sensing import Sensed
 from ..validated_range import ValidatedRange
-from .aside import Aside
 from .audits import Audits
 from .calibration import departures, held, hold
 from .drift import Drift
@@ -149,7 +149,7 @@ class GraphLoop:
         if engine.waiting:
             return []  # a board may yet tell where these were made
         passed = [p for p in sensed.bundle.picks if p.camera != "b_rgb" and p.stamp_ns < engine.end_ns]
-        found = [p for p in passed if engine.seen_from(p.camera, p.stamp_ns) is None]
+        found = [p for p in passed if p.stamp_ns not in engine.keyframe_at]
         self.counts["picks_too_late"] += len(found)
         return found
 

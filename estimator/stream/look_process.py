@@ -88,7 +88,7 @@ class LookLoop(FrontEnd):
 
     def _present(self, items: list[Item], tracked: Tracked) -> dict[str, tuple[Outline, ...]]:
         self._note(items)
-        sensed = self._sensing.look(items, tracked.frame, tracked.memorable)
+        sensed = self._sensing.look(items, tracked.frame, memorable=tracked.memorable)
         self._remember(sensed.bundle.frame)
         self._hand_on(sensed)
         del self._sensing.sensors.rejected[:-REFUSALS]

@@ -144,7 +144,11 @@ def _joint(engine: Engine, solution: BatchSolution | None) -> tuple[Atlas, Gauss
         ObservabilityError: something else than a landmark is not determined.
     """
     values = engine.solver.values() if solution is None else solution.values
-    views = {t: n for t, n in engine.odometry.observations.items() if values.exists(keys.landmark(t))}
+    views = {
+        t: n
+        for t, n in engine.odometry.observations.items()
+        if values.exists(keys.landmark(t)) and not engine.adrift.holds(keys.landmark(t))
+    }
     while True:
         atlas, joint = engine.album.chosen(views, JOINT_LANDMARKS)
         stay = [*long_lived(values), *map(keys.landmark, joint)]

@@ -11,6 +11,7 @@ from ..undistort import distort, undistort
 from . import points
 from .atlas import Atlas, Memorable, settled_tracks
 from .detection import apart, detect
+from .finding import FADING, Finding, Found
 from .flow import checked_flow, inside
 from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
 from .keyframes import keyframe_reason
@@ -19,7 +20,7 @@ from .motion import Motion, estimate_motion
 from .noise import NoiseModel
 from .observer import Keyview, Observer, expected_depth
 from .pair import StereoPair, prepare
-from .places import ALIKE, BEFORE_ALL_NS, PlaceStore, Relocalisation
+from .places import PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
 from .sighting import Sighting, blind_frame, nothing_seen
@@ -30,12 +31,6 @@ Bool = NDArray[np.bool_]
 Early = Callable[[Float, int], object]
 """Takes `last_T_this` (4, 4) by the flow alone and its number of inliers, while a keyframe is still in the making."""
 
-_FADING = 0.7
-"""Share of the velocity that is left after each frame without tracks: a hand does not go straight on for seconds."""
-_STRAYED_ALIKE = 0.4
-"""Correlation of thumbnails from which on a place is worth a look after the tracks have broken."""
-_APART_M = 1000.0
-"""Between chains that nothing joins."""
 _CALM_PX = 1.5
 """Surprise of the flow up to which the next one starts at full resolution: its window reaches twice as far."""
 
@@ -58,7 +53,7 @@ class StereoFrontEnd:
         self.settings = settings or StereoSettings()
         self.rig = StereoGeometry(left, right, m_left_T_m_right)
         self.landmarks = LandmarkStore(self.settings.store_landmarks)
-        self.places = PlaceStore(self.settings.store_keyframes, self.rig)
+        self.finding = Finding(PlaceStore(self.settings.store_keyframes, self.rig), self.settings)
         self._diagonal = float(np.hypot(left.width, left.height))
         self._noise = NoiseModel()
         self._vertical = VerticalCorrection(self.rig)
@@ -73,12 +68,10 @@ class StereoFrontEnd:
         self._velocity = np.zeros(6)
         self._surprise_px = np.inf
         """By how much the last flow differed from what constant velocity foretold."""
-        self._strayed_ns: int | None = None
-        """When the tracks broke without a known place having been found since."""
+        self._own_from = 0
+        """First track id of this run."""
         self.memorable: Memorable | None = None
         """What the last pair added to what can be found again."""
-        self._own_from: int | None = None
-        """First track id of this run, while its chain has not been joined to that of an earlier run."""
 
     @property
     def chain_T_keyframe(self) -> Float:
@@ -93,10 +86,8 @@ class StereoFrontEnd:
         if not atlas:
             return
         self.landmarks.recall(atlas.tracks)
-        self.places.recall(atlas.places)
         self._next_id = self._own_from = atlas.next_id()
-        far = [place.chain_T_keyframe[:3, 3] for place in atlas.places]
-        self._chain_T_keyframe[0, 3] = _APART_M + max((float(np.abs(t).max()) for t in far), default=0.0)
+        self._chain_T_keyframe[0, 3] = self.finding.recall(atlas.places)
 
     def process(
         self,
@@ -119,7 +110,7 @@ class StereoFrontEnd:
         self.memorable = None
         if self._last is None:
             self._last = pair
-            if self._own_from is not None:
+            if self.finding.apart:
                 return self._recover(pair, np.eye(4))
             return self._restart(pair, np.eye(4), lost=False)
         guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
@@ -140,7 +131,7 @@ class StereoFrontEnd:
 
         `process` calls the same search by itself when the tracks break.
         """
-        return self.places.find(prepare(stamp_ns, left, right).left, self.settings.min_relocalisation)
+        return self.finding.find(prepare(stamp_ns, left, right).left)
 
     def match_landmarks(self, ids: Int, points_m: Float) -> tuple[Int, Sighting]:
         """Looks for old landmarks in the last keyframe's images, near where an estimate expects them.
@@ -364,29 +355,19 @@ class StereoFrontEnd:
         The place's features agree on one motion, and then its landmarks on another one near it; else the chain stays.
         """
         nothing = no_tracks(self._observer.grid), nothing_seen()
-        found = self._place_of_before(view)
+        found = self.finding.look_back(view.pair.left, view.pair.stamp_ns)
         if found is None:
             return nothing
-        drifted = self._chain_T_keyframe
-        self._chain_T_keyframe = self.places.chain_pose(found.stamp_ns) @ found.keyframe_T_this
+        drifted, self._chain_T_keyframe = self._chain_T_keyframe, found.chain_T_this
         tracks, seen, correction = self._seen_again(view)
         if len(tracks) < self.settings.min_inliers:
             self._chain_T_keyframe = drifted
             return nothing
         self._correct_chain(correction)
-        self._strayed_ns = None
-        self._join(self._chain_T_keyframe @ inverse(drifted), found)
+        self.finding.verified()
+        if found.joins:
+            self._join(self._chain_T_keyframe @ inverse(drifted))
         return tracks, seen
-
-    def _place_of_before(self, view: Keyview) -> Relocalisation | None:
-        """A remembered place that a keyframe may show."""
-        left, least = view.pair.left, 2 * self.settings.min_relocalisation
-        if self._own_from is not None:
-            return next(iter(self.places.find(left, least, BEFORE_ALL_NS)), None)
-        before_ns, alike = view.pair.stamp_ns - self.settings.loop_ns, ALIKE
-        if self._strayed_ns is not None:
-            before_ns, alike = max(before_ns, self._strayed_ns), _STRAYED_ALIKE
-        return self.places.look_back(left, before_ns, least, alike)
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
         """Takes up the drift that landmarks seen again show; the points of living tracks are relative and stay."""
@@ -398,11 +379,8 @@ class StereoFrontEnd:
         self._keyframe_count = len(tracks)
         variance = sighting.left_covariance[:, 1, 1] + sighting.right_covariance[:, 1, 1]
         self._vertical.learn(sighting.left_px, sighting.right_px, variance)
-        pair, pose = view.pair, self._chain_T_keyframe
-        added = self.places.add(pair.stamp_ns, pose, pair.left, tracks.ids, tracks.raw_px, tracks.points)
-        self.memorable = Memorable(settled_tracks(tracks, pose), added)
-        return StereoFrame(
-            stamp_ns=pair.stamp_ns,
+        frame = StereoFrame(
+            stamp_ns=view.pair.stamp_ns,
             is_keyframe=True,
             track_ids=tracks.ids.copy(),
             left_px=sighting.left_px,
@@ -413,37 +391,39 @@ class StereoFrontEnd:
             motion_inliers=inliers,
             lost=lost,
         )
+        pose = self._chain_T_keyframe
+        added = self.finding.remember(frame, pose, view.pair.left, tracks.raw_px, tracks.points)
+        self.memorable = Memorable(settled_tracks(tracks, pose), added)
+        return frame
 
     # -- losing and finding --------------------------------------------------------------------------------------
 
     def _recover(self, pair: StereoPair, guess: Float) -> StereoFrame:
         """The tracks do not connect: goes on from a remembered place, or from where constant velocity leads to."""
+        assert self._last is not None
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
-        found = self.places.find(pair.left, self.settings.min_relocalisation * (1 if self._own_from is None else 2))
-        if not found and self._strayed_ns is None:
-            self._strayed_ns = self._last.stamp_ns if self._last is not None else None
-        if found:
-            self._strayed_ns = None
-            chain_T_this = self.places.chain_pose(found[0].stamp_ns) @ found[0].keyframe_T_this
-            chain_T_last = self._chain_T_keyframe @ self._keyframe_T_last
-            if self._join(chain_T_this @ inverse(chain_T_last @ last_T_this), found[0]):
-                # The chain has moved, not the camera.
-                self._chain_T_keyframe = chain_T_this @ inverse(self._keyframe_T_last @ last_T_this)
-            else:
-                last_T_this = inverse(chain_T_last) @ chain_T_this
-        self._velocity = _FADING * self._velocity
+        found = self.finding.lost(pair.left, self._last.stamp_ns)
+        if found is not None:
+            last_T_this = self._led_to(found, last_T_this)
+        self._velocity = FADING * self._velocity
         return self._restart(pair, last_T_this, lost=True)
 
-    def _join(self, new_T_old: Float, found: Relocalisation) -> bool:
-        """The own chain becomes part of an earlier run's, if it was not and the place is one of then."""
-        if self._own_from is None or found.stamp_ns >= BEFORE_ALL_NS:
-            return False
-        self.places.move(new_T_old)
+    def _led_to(self, found: Found, predicted: Float) -> Float:
+        """`last_T_this` by a place that was found. Where the own chain joins that of an earlier run, it is the chain
+        that has moved, and the camera as it was predicted."""
+        chain_T_last = self._chain_T_keyframe @ self._keyframe_T_last
+        if not found.joins:
+            return inverse(chain_T_last) @ found.chain_T_this
+        self._join(found.chain_T_this @ inverse(chain_T_last @ predicted))
+        self._chain_T_keyframe = found.chain_T_this @ inverse(self._keyframe_T_last @ predicted)
+        return predicted
+
+    def _join(self, new_T_old: Float) -> None:
+        """The own chain becomes part of an earlier run's."""
+        self.finding.join(new_T_old)
         self.landmarks.move(self._own_from, new_T_old)
         self._tracks.patch_poses = new_T_old @ self._tracks.patch_poses
-        self._own_from = None
-        return True
 
     def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
         """A keyframe of landmarks seen again and new tracks; no keyframe where the view holds nothing to start from."""

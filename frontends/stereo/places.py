@@ -236,11 +236,12 @@ def _matches(theirs: Image, raw: Float, descriptors: Image) -> tuple[NDArray[np.
     """Rows of descriptors that are nearest to each other, and nearer than to any of another place in the image."""
     if len(descriptors) <= _RIVALS:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance, index = cv2.batchDistance(theirs, descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=_RIVALS)
+    found = cv2.batchDistance(theirs, descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=_RIVALS)
+    distance, index = np.asarray(found[0], np.int64), np.asarray(found[1], np.intp)
     elsewhere = np.linalg.norm(raw[index[:, 1:]] - raw[index[:, :1]], axis=2) > _SAME_PX
-    rival = np.where(elsewhere, distance[:, 1:], np.iinfo(np.int32).max).min(axis=1)
+    rival = np.where(elsewhere, distance[:, 1:], np.iinfo(np.int64).max).min(axis=1)
     good = distance[:, 0] < _CLEAR * rival
-    return np.flatnonzero(good), index[good, 0].astype(np.intp)
+    return np.flatnonzero(good), index[good, 0]
 
 
 def _thumbnail(image: Image) -> Float32:

@@ -13,12 +13,12 @@ import traceback
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from ...factors.errors import SurecutError
+from ..factors.errors import SurecutError
 
 Made = TypeVar("Made")
 
 NICENESS = 4
-"""Below the process itself."""
+"""Of work that nobody waits for."""
 BLOCK = 1 << 16
 
 
@@ -27,10 +27,12 @@ class Aside(Generic[Made]):
 
     Args:
         apart: in a copy; else at once and here, as where the system has no fork.
+        niceness: below the process itself.
     """
 
-    def __init__(self, apart: bool) -> None:
+    def __init__(self, apart: bool, niceness: int = NICENESS) -> None:
         self._apart = apart and hasattr(os, "fork")
+        self._niceness = niceness
         self._pid = 0
         self._end = -1
         self._said = b""
@@ -50,7 +52,7 @@ class Aside(Generic[Made]):
         self._said = b""
         self._pid = os.fork()
         if self._pid == 0:
-            _copy(work, theirs)
+            _copy(work, theirs, self._niceness)
         os.close(theirs)
 
     def taken(self) -> Made | None:
@@ -65,6 +67,16 @@ class Aside(Generic[Made]):
         found = self._result.pop()
         if isinstance(found, SurecutError):
             raise found
+        return found
+
+    def awaited(self) -> Made:
+        """The result of what has begun, as soon as it is there.
+
+        Raises:
+            SurecutError: what the work has raised, or what it died of.
+        """
+        while (found := self.taken()) is None:
+            select.select([self._end], [], [])
         return found
 
     def stop(self) -> None:
@@ -101,10 +113,10 @@ def _done(work: Callable[[], Made]) -> Made | SurecutError:
         )
 
 
-def _copy(work: Callable[[], object], end: int) -> None:
+def _copy(work: Callable[[], object], end: int, niceness: int) -> None:
     """The copy's life; it never returns."""
     try:
-        os.nice(NICENESS)
+        os.nice(niceness)
         said = pickle.dumps(_done(work))
         while said:
             said = said[os.write(end, said) :]
