@@ -1,6 +1,6 @@
 """The refinement after the run: everything relinearised at once, outliers told apart, then solved again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -11,6 +11,8 @@ from ..factors import keys
 from ..factors.measurements import Rejection
 from ..factors.noise import robust_scale
 from ..factors.projection import reweighed
+from .corner_variance import as_stated, corner_variance
+from .corner_variance import weights as corner_weights
 from .graph import FactorLog, Record
 from .linear import deviate
 from .linearised import Linearised, linearise, with_correlated_tracks
@@ -71,22 +73,27 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             values, more = optimum(without_factors(log, off), at.values, ON_THE_WAY)
             at = linearise(log, off, values, robust_sigma)
             iterations += more
-    at, more, slack = _with_track_weights(log, off, at, robust_sigma)
-    at = with_correlated_tracks(at, ODOMETRY, slack)
+    variance = corner_variance(at)
+    at, more, slack = _with_weights(log, off, at, robust_sigma, corner_weights(at, variance))
+    at = as_stated(with_correlated_tracks(at, ODOMETRY, slack), variance)
     iterations += more
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
-def _with_track_weights(
-    log: FactorLog, off: set[int], at: Linearised, robust_sigma: float
+def _with_weights(
+    log: FactorLog, off: set[int], at: Linearised, robust_sigma: float, corners: Mapping[int, float]
 ) -> tuple[Linearised, int, float]:
-    """The optimum with tracks weighed by what they are worth, the iterations to there, and the weights' slack."""
+    """The optimum with tracks weighed by what they are worth, the iterations to there, and the weights' slack.
+
+    Args:
+        corners: weights of marker corners, by position.
+    """
     weights = track_weights(at.active, at.system, ODOMETRY)
-    if not weights.by_position:
+    if not weights.by_position and not corners:
         values, iterations = optimum(without_factors(log, off), at.values) if off else (at.values, 0)
         return (linearise(log, off, values, robust_sigma) if iterations else at), iterations, 1.0
     factors = {}
-    for position, weight in weights.by_position.items():
+    for position, weight in {**weights.by_position, **corners}.items():
         index, factor, record = at.active[position]
         factors[index] = reweighed(factor, record.camera or "", weight, robust_sigma)
     weighed = log.replaced(factors)
