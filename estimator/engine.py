@@ -22,6 +22,7 @@ from ..factors.measurements import (
 from ..factors.rig import Distance, Rig
 from ..frontends.pick_image import CutOut
 from .adrift import Adrift
+from .album import Album
 from .boards import Boards
 from .bundle import Bundle
 from .calibration_states import opened_calibration
@@ -35,7 +36,7 @@ from .open_graph import OpenGraph
 from .open_views import UNPLACED, OpenViews
 from .pipe_parts import SeenFrom
 from .pipes import Pipes
-from .placement import place
+from .placement import place, place_by_landmarks
 from .surfaces import Associator, Surfaces, SurfaceSettings
 
 MARKER_KEYFRAMES = 10
@@ -97,6 +98,7 @@ class Engine:
         self.astray = False
         """The map is from an earlier run, and the camera has not found itself in it."""
         self.end_ns = 0
+        self.album = Album()
 
     # The loop -------------------------------------------------------------------------------------------------
 
@@ -174,10 +176,14 @@ class Engine:
                 self.machine.lay_landmarks(index)
 
     def _relocalised(self, bundle: Bundle) -> gtsam.Pose3 | None:
-        """Where the camera stands in the map of an earlier run, by the boards that it sees."""
-        if not _mobile(bundle):
-            return None
-        return place(self.boards, self.state, bundle.sightings, (gtsam.Pose3(), 1 << 62))
+        """Where the camera stands in the map of an earlier run, by the boards that it sees, or by landmarks of then
+        that the front end has found again."""
+        found = None
+        if _mobile(bundle):
+            found = place(self.boards, self.state, bundle.sightings, (gtsam.Pose3(), 1 << 62))
+        if found is None and bundle.frame is not None:
+            found = place_by_landmarks(self.state, bundle.frame, self.odometry.observations)
+        return found
 
     def promote(self, bundle: Bundle) -> bool:
         """Makes a frame of the recent past a keyframe, because somebody clicked in it; False where that is too late."""

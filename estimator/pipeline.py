@@ -45,6 +45,8 @@ class Pipeline:
         engine = self.engine
         engine.cameras.update(sensed.cameras)
         engine.add(sensed.bundle)
+        if sensed.atlas is not None:
+            engine.album.add(sensed.atlas, engine.odometry.observations.keys())
         engine.pick_images.update(sensed.clicked)
         if sensed.pair is not None and sensed.stamp_ns in engine.keyframe_at:
             self._outlines.see(sensed.pair, sensed.bundle.picks)

@@ -1,6 +1,6 @@
 """Where a keyframe without tracks stands: from the corners of known boards in either mobile camera."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 
 import gtsam
 import numpy as np
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from ..factors.geometry import pose3
-from ..factors.measurements import MarkerSighting
+from ..factors.measurements import MarkerSighting, StereoFrame
 from ..frontends.resection import camera_pose
 from .boards import Boards
 from .graph import State
@@ -21,6 +21,9 @@ FREE_POINTS = 8
 """Corners from which a pose is found without help; one marker alone allows two."""
 RECENT_NS = 300_000_000
 """A camera in the hand has not gone far since: of two poses the nearer one is right."""
+FEWEST_LANDMARKS = 12
+LANDMARKS_PX = 2.0
+"""Largest median reprojection error of landmarks seen again."""
 SAME_RAD, SAME_M = 0.05, 0.1
 """Poses nearer to each other than this are one."""
 
@@ -45,6 +48,25 @@ def place(
     if near[1] > RECENT_NS:
         return None
     return min([best, *rivals], key=lambda pose: float(np.linalg.norm(gtsam.Pose3.Logmap(near[0].between(pose)))))
+
+
+def place_by_landmarks(state: State, frame: StereoFrame, wanted: Container[int]) -> gtsam.Pose3 | None:
+    """`o_T_m` from where a frame shows landmarks again; None where these are too few, or do not agree.
+
+    Args:
+        wanted: tracks that count.
+    """
+    old = [
+        (row, state.point(keys.landmark(track)))
+        for row, track in enumerate(frame.track_ids.tolist())
+        if track in wanted and state.has(keys.landmark(track))
+    ]
+    if len(old) < FEWEST_LANDMARKS:
+        return None
+    px = frame.left_px[[row for row, _ in old]]
+    K = state.intrinsics(keys.intrinsics("m_left")).K()
+    found = camera_pose(np.array([point for _, point in old]), px, K)
+    return None if found is None or found[1] > LANDMARKS_PX else pose3(found[0])
 
 
 def _views(

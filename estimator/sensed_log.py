@@ -30,6 +30,7 @@ from .threads import single_threaded_children
 
 if TYPE_CHECKING:
     from ..factors.measurements import StereoFrame
+    from ..frontends.stereo.atlas import Memorable
     from .items import Item
     from .sensing import Sensed
 
@@ -54,6 +55,8 @@ class _Followed:
     frame: "StereoFrame | None"
     warnings: tuple[str, ...]
     """What has been found wrong with the recording so far."""
+    memorable: "Memorable | None" = None
+    """What the frame added to what can be found again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +160,8 @@ def _follow(log: Path, rig: Rig, out: Any) -> None:
     try:
         for group in sensing.groups(reader):
             frame = sensing.follow(group)
-            out.put(_Followed(group[0].stamp_ns, sensing.needed(group, frame), frame, tuple(reader.warnings)))
+            needed, memorable = sensing.needed(group, frame), sensing.memorable(frame)
+            out.put(_Followed(group[0].stamp_ns, needed, frame, tuple(reader.warnings), memorable))
         out.put(_End(replace(report(), sha256=reader.sha256())))
     except SurecutError as error:
         out.put(_End(report(), error))
@@ -179,7 +183,7 @@ def _look(rig: Rig, followed: Any, out: Any) -> None:
     try:
         while not isinstance(item := followed.get(), _End):
             warnings = item.warnings
-            out.put(sensing.look(item.items, item.frame, item.stamp_ns))
+            out.put(sensing.look(item.items, item.frame, item.stamp_ns, item.memorable))
         out.put(replace(item, report=report(item.report)))
     except SurecutError as error:
         out.put(_End(report(RecordingReport(SensingReport(), warnings)), error))

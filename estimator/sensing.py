@@ -12,7 +12,9 @@ from ..factors.camera import CameraModel
 from ..factors.measurements import MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
 from ..frontends.pick_image import CutOut, cut_out
+from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early
+from ..frontends.stereo.places import place_of
 from ..io.messages import CameraInfoBody, CloudBody, DepthBody, DetectionsBody, ImageBody, Message, PickBody
 from ..io.ordering import OrderReport, sorted_by_stamp
 from ..io.pairing import PairingReport, StereoPair, stereo_pairs
@@ -38,6 +40,8 @@ class Sensed:
     """What was clicked, by camera, stamp and point id."""
     cameras: Mapping[str, CameraModel] = field(default_factory=dict)
     """Cameras whose calibration has become known with this stamp."""
+    atlas: Atlas | None = None
+    """What a keyframe adds to what can be found again."""
 
     @property
     def stamp_ns(self) -> int:
@@ -59,9 +63,13 @@ class SensingReport:
 class Sensing:
     """Front ends of one run, fed with messages."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, atlas: Atlas | None = None) -> None:
+        """
+        Args:
+            atlas: what an earlier run saw.
+        """
         self.rig = rig
-        self.sensors = Sensors(rig)
+        self.sensors = Sensors(rig, atlas)
         self._order = OrderReport()
         self._pairing = PairingReport()
         self._sides = Sides(rig)
@@ -93,7 +101,7 @@ class Sensing:
     def process(self, group: list[Item]) -> Sensed:
         """All messages of one stamp."""
         frame = self.follow(group)
-        return self.look(self.needed(group, frame), frame, group[0].stamp_ns)
+        return self.look(self.needed(group, frame), frame, group[0].stamp_ns, self.memorable(frame))
 
     def follow(self, group: list[Item], early: Early | None = None) -> StereoFrame | None:
         """How the mobile camera moved: tracks and motion of the pair in a group, None where there is no pair.
@@ -107,6 +115,10 @@ class Sensing:
         self.calibrate(group)
         pair = next((images(i) for i in group if isinstance(i, StereoPair)), None)
         return self.sensors.track(pair, _clicked(group), early) if pair is not None else None
+
+    def memorable(self, frame: StereoFrame | None) -> Memorable | None:
+        """What the frame that was followed last added to what can be found again."""
+        return None if frame is None else self.sensors.memorable()
 
     def needed(self, group: list[Item], frame: StereoFrame | None) -> list[Item]:
         """What `look` needs of a group that has been followed: most pictures and calibrations tell it nothing new."""
@@ -123,13 +135,20 @@ class Sensing:
         self._needed_cameras[camera] = model
         return known
 
-    def look(self, group: list[Item], frame: StereoFrame | None, stamp_ns: int | None = None) -> Sensed:
+    def look(
+        self,
+        group: list[Item],
+        frame: StereoFrame | None,
+        stamp_ns: int | None = None,
+        memorable: Memorable | None = None,
+    ) -> Sensed:
         """Everything else that a group shows.
 
         Args:
             group: whole, or what is `needed` of it.
             frame: what `follow`, of this object or another, has said of the pair.
             stamp_ns: the group's, where nothing of it may be left.
+            memorable: what the frame added to what can be found again.
 
         Raises:
             LogError: a part of it cannot be used.
@@ -154,6 +173,7 @@ class Sensing:
             kept,
             self._clicked(picks, pair, group),
             fresh,
+            None if memorable is None else _atlas_of(memorable),
         )
 
     def look_back(self, clicks: Sequence[Message], pair: PairImages, frame: StereoFrame) -> Sensed:
@@ -253,6 +273,12 @@ class Sensing:
             if image is not None:
                 found[pick.camera, pick.stamp_ns, pick.point_id] = cut_out(image, pick.raw_px)
         return found
+
+
+def _atlas_of(memorable: Memorable) -> Atlas:
+    """With the view described."""
+    view = memorable.view
+    return Atlas(() if view is None else (place_of(view),), memorable.tracks)
 
 
 def _clicked(group: list[Item]) -> bool:

@@ -16,6 +16,7 @@ from ..factors.rig import Rig
 from ..frontends.fiducials.detector import MarkerFrontEnd
 from ..frontends.fiducials.messages import sightings_from_messages
 from ..frontends.paper_chain import clicked_point
+from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early, StereoFrontEnd
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
@@ -55,8 +56,13 @@ class PairImages:
 class Sensors:
     """All front ends of one rig."""
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, atlas: Atlas | None = None) -> None:
+        """
+        Args:
+            atlas: what an earlier run saw.
+        """
         self.rig = rig
+        self._atlas = atlas or Atlas()
         self.cameras: dict[str, CameraModel] = {}
         self._given: dict[str, CameraModel] = {}
         """The last calibration that came, as the decoder gave it: mostly the very same object."""
@@ -104,10 +110,16 @@ class Sensors:
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
             self._stereo = StereoFrontEnd(left, right, self.left_T_right())
+            self._stereo.recall(self._atlas)
+            self._atlas = Atlas()
         frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right, wanted, early)
         if self._unmatched < UNMATCHED_PAIRS:
             self._check_sides(pair, frame)
         return frame
+
+    def memorable(self) -> Memorable | None:
+        """What the last pair added to what can be found again."""
+        return None if self._stereo is None else self._stereo.memorable
 
     def left_T_right(self) -> Float:
         """Nominal pose of the right mobile camera in the left one, (4, 4)."""

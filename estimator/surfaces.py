@@ -122,6 +122,14 @@ class Surfaces:
         self._tried = {t: n for t, n in self._tried.items() if t not in landmarks}
         self.refused = {t: r for t, r in self.refused.items() if t not in landmarks}
 
+    def laid(self) -> tuple[set[int], dict[tuple[int, int], int]]:
+        """Landmarks that lie on this station's surfaces, and how many share the distortion of a part of the view."""
+        return set(self._laid), dict(self._shared)
+
+    def recall(self, laid: set[int], shared: dict[tuple[int, int], int]) -> None:
+        """What an earlier run has laid at this station is not laid again: it was the same error of the same camera."""
+        self._laid, self._shared = laid, shared
+
     def _candidates(self, observations: dict[int, int]) -> list[int]:
         rows = []
         for track, count in observations.items():

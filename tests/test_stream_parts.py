@@ -196,11 +196,29 @@ def test_wrong_motions_widen_the_pose():
     for follower, off in ((good, 0.0), (bad, 0.02)):
         for i in range(60):
             follower.frame(frame(i, keyframe=True))
-            # the graph says that each step was longer than the front end did
-            follower.anchor(frame(i).stamp_ns, Place(step((0.01 + off) * i), 1e-8 * np.eye(6)))
+            # the graph says that each step went aside too, one to the left, the next one to the right
+            placed = step(0.01 * i)
+            placed[1, 3] = off * (i % 2)
+            follower.anchor(frame(i).stamp_ns, Place(placed, 1e-8 * np.eye(6)))
     sizes = [np.sqrt(f.frame(frame(60, keyframe=True)).covariance[3, 3]) for f in (good, bad)]
-    assert sizes[1] == pytest.approx(0.02, rel=0.15)
+    assert sizes[1] == pytest.approx(0.02 / np.sqrt(3), rel=0.15)
     assert sizes[0] < 0.2 * sizes[1]
+
+
+@pytest.mark.parametrize("longer", [0.9, 1.0, 1.1])
+def test_ways_that_are_all_too_short_are_made_longer(longer):
+    """A depth that always reads short makes every way short: the graph knows, and the pose in between follows it."""
+    follower = Follower()
+    for i in range(60):
+        follower.frame(Frame(START + i * 50 * MS, step(0.1), True, False, 50))
+        follower.anchor(START + i * 50 * MS, Place(step(0.1 * longer * i), 1e-8 * np.eye(6)))
+    followed = follower.frame(Frame(START + 60 * 50 * MS, step(0.1), True, False, 50))
+    assert followed.matrix[0, 3] == pytest.approx(6.0 * longer, abs=0.001)
+    assert np.sqrt(followed.covariance[3, 3]) < 0.01
+    new = Follower()  # one that has not compared anything yet knows that it may be wrong by as much
+    new.anchor(START, Place(step(0.0), 1e-8 * np.eye(6)))
+    sigma = np.sqrt(new.frame(Frame(START + 50 * MS, step(0.1), True, False, 50)).covariance[3, 3])
+    assert sigma == pytest.approx(0.05 * 0.1, rel=0.1)
 
 
 def test_covariance_grows_as_its_formula_says():

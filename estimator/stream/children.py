@@ -57,7 +57,7 @@ class Children:
         """Starts them.
 
         Args:
-            prior: checkpoint that the graph begins with.
+            prior: checkpoint that tracking and graph begin with.
         """
         settings, processes = self._task.settings, self._context
         self._to_track = processes.Queue(settings.tracking_ahead)
@@ -65,7 +65,7 @@ class Children:
         self._to_graph = processes.Queue(settings.graph_ahead)
         task, rig = replace(self._task, prior=prior), self._task.rig
         work = (
-            ("track", (rig, settings, task.patient, self._to_track, self._to_look)),
+            ("track", (rig, settings, task.patient, prior, self._to_track, self._to_look)),
             ("look", (rig, settings, task.patient, self._to_look, self._to_graph)),
             ("solve", (task, self._to_graph)),
         )

@@ -16,10 +16,18 @@ KEPT = 2000
 """Frames that the graph may be behind."""
 LOST_SPEED_M_S, LOST_TURN_RAD_S = 0.5, 1.0
 """Standard deviation of a hand-held camera's velocity about its last one, while nothing is tracked; as in the graph."""
-FIRST_STEP = np.array([2e-3] * 3 + [3e-3] * 3) ** 2
-"""Variance (rad^2, m^2) of the motion between two keyframes before any has been compared with the graph."""
+FIRST_TURN_RAD, FIRST_SHARE = 2e-3, 0.05
+"""Standard deviation of the motion between two keyframes before any has been compared with the graph: of the turn, and
+of each component of the way as a share of its length."""
+WORTH = 4.0
+"""Comparisons that these count as."""
 MEMORY = 0.05
-"""Share of the newest comparison in the running variance."""
+"""Least share of the newest comparison in the running figures."""
+NEAR_M = 0.03
+"""A shorter way is as uncertain as this one."""
+SCALE_SIGMA = 0.1
+"""How far the front end's ways may be too long or too short, as a share: it knows the cameras as they were given, and a
+depth that is always too short makes every way too short."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +43,35 @@ class Followed:
     """Frames since the graph's keyframe."""
 
 
+class Ratio:
+    """How much longer ways are than the front end says: least squares over what the graph said; old ones fade."""
+
+    def __init__(self) -> None:
+        self._information = 1.0 / SCALE_SIGMA**2
+        self._weighted = 0.0
+
+    @property
+    def excess(self) -> float:
+        return self._weighted / self._information
+
+    def applied(self, a_T_b: Float) -> Float:
+        """A motion (4, 4) of the front end, as long as the graph would have it."""
+        longer = a_T_b.copy()
+        longer[:3, 3] *= 1.0 + self.excess
+        return longer
+
+    def learn(self, chain_m: Float, graph_m: Float, share_variance: float) -> None:
+        """One way (3,) as both saw it.
+
+        Args:
+            share_variance: of a way's components, as a share of its length.
+        """
+        weight = 1.0 / (share_variance * (float(chain_m @ chain_m) + NEAR_M**2))
+        first = 1.0 / SCALE_SIGMA**2
+        self._information += MEMORY * (first - self._information) + weight * float(chain_m @ chain_m)
+        self._weighted += -MEMORY * self._weighted + weight * float(chain_m @ (graph_m - chain_m))
+
+
 class Follower:
     """Chains the front end's motions. How wrong they are is learned from the graph: each time it places a keyframe,
     what the chain had said since the one before is compared with it."""
@@ -45,8 +82,14 @@ class Follower:
         self._anchor = Place(np.eye(4), np.zeros((6, 6)))
         self._since = np.eye(4)
         """From the anchor to the newest frame."""
-        self._variance = FIRST_STEP.copy()
-        """Of the motion between two keyframes, shape (6,), rotation first."""
+        self._way_m = 0.0
+        """Length of the way since the anchor."""
+        self._ratio = Ratio()
+        self._compared = WORTH
+        self._turn_variance = np.full(3, FIRST_TURN_RAD**2)
+        """Of the turn between two keyframes, rad^2."""
+        self._share_variance = FIRST_SHARE**2
+        """Of each component of a way, as a share of its length."""
         self._steps = 0.0
         """Keyframe intervals since the anchor, the last one in part."""
         self._lost_s = 0.0
@@ -82,6 +125,7 @@ class Follower:
         self._learn(stamp_ns, place)
         self._anchor_ns, self._anchor = stamp_ns, place
         self._since, self._steps, self._lost_s, self._at_ns = np.eye(4), 0.0, 0.0, stamp_ns
+        self._way_m = 0.0
         newest = stamp_ns
         for stamp, frame in self._frames.items():
             if stamp > stamp_ns:
@@ -92,7 +136,9 @@ class Follower:
         return self._now(newest)
 
     def _add(self, frame: Frame) -> None:
-        self._since = self._since @ frame.last_T_this
+        step = self._ratio.applied(frame.last_T_this)
+        self._since = self._since @ step
+        self._way_m += float(np.linalg.norm(step[:3, 3]))
         whole = float(np.floor(self._steps))
         self._steps = whole + 1.0 if frame.is_keyframe else whole + 0.5
         if frame.lost:
@@ -111,20 +157,30 @@ class Follower:
                 lost |= frame.lost
         if not steps or lost:
             return
-        graph = pose3(np.linalg.inv(self._anchor.matrix) @ place.matrix)
-        off = gtsam.Pose3.Logmap(pose3(chain).between(graph))
-        self._variance += MEMORY * (off**2 / steps - self._variance)
+        graph = np.linalg.inv(self._anchor.matrix) @ place.matrix
+        self._ratio.learn(chain[:3, 3], graph[:3, 3], self._share_variance)
+        off = gtsam.Pose3.Logmap(pose3(self._ratio.applied(chain)).between(pose3(graph)))
+        length = float(np.linalg.norm(chain[:3, 3]))
+        self._compared += 1.0
+        newest = max(1.0 / self._compared, MEMORY)
+        self._turn_variance += newest * (off[:3] ** 2 / steps - self._turn_variance)
+        share = float(off[3:] @ off[3:]) / 3.0 / (length**2 + NEAR_M**2)
+        self._share_variance += newest * (share - self._share_variance)
 
     def _now(self, stamp_ns: int) -> Followed:
-        chain, steps = self._since, self._steps
+        chain, steps, way_m = self._since, self._steps, self._way_m
         if self._early is not None:  # one on from the newest of the chain
-            stamp_ns, chain, steps = self._early.stamp_ns, chain @ self._early.last_T_this, float(np.floor(steps)) + 0.5
+            step = self._ratio.applied(self._early.last_T_this)
+            stamp_ns, chain, steps = self._early.stamp_ns, chain @ step, float(np.floor(steps)) + 0.5
+            way_m += float(np.linalg.norm(step[:3, 3]))
         since = pose3(chain)
         matrix = self._anchor.matrix @ chain
         own = self._anchor.covariance if self._anchor.covariance is not None else np.zeros((6, 6))
         back = since.inverse().AdjointMap()
         turned, moved = LOST_TURN_RAD_S * self._lost_s, LOST_SPEED_M_S * self._lost_s
         lost = np.array([turned**2] * 3 + [moved**2] * 3)
-        covariance = back @ own @ back.T + np.diag(steps * self._variance + lost)
+        followed = self._share_variance * (way_m**2 + NEAR_M**2) if steps else 0.0
+        moving = np.concatenate([steps * self._turn_variance, np.full(3, followed)])
+        covariance = back @ own @ back.T + np.diag(moving + lost)
         behind = sum(stamp > (self._anchor_ns or 0) for stamp in self._frames)
         return Followed(stamp_ns, matrix, covariance, behind)

@@ -23,6 +23,7 @@ from ..sensing import Sensed
 from ..validated_range import ValidatedRange
 from .audits import Audits
 from .calibration import departures, held, hold
+from .drift import Drift
 from .glances import Glance
 from .knocks import Knocks
 from .memory import Memory, recall, remember, save
@@ -73,6 +74,7 @@ class GraphLoop:
             recall(self.engine, memory)
             self._bounded.first = memory.keyframes
         self._knocks = Knocks(self.engine)
+        self._drift = Drift(self.engine)
         self._audits = Audits(self.engine, settings.audit_period_ns, apart)
         self._saving: Aside[str] = Aside(apart)
         self._live = apart
@@ -98,6 +100,7 @@ class GraphLoop:
         if self._first_ns is None:
             self._first_ns = sensed.stamp_ns
         before, told = self.engine.odometry.last_keyframe, self._told()
+        drifted = self._drift.see(sensed.bundle.frame)
         try:
             self.pipeline.take(sensed)
         except ObservabilityError as error:
@@ -106,11 +109,11 @@ class GraphLoop:
             raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
         new = self.engine.odometry.last_keyframe > before
         clicked = bool(sensed.bundle.picks)
-        self._changed |= new or clicked or self._told() != told
+        self._changed |= new or clicked or drifted or self._told() != told
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
         self.counts["picks"] += len(sensed.bundle.picks)
-        self._answer_when_due(sensed.stamp_ns, clicked, busy)
+        self._answer_when_due(sensed.stamp_ns, clicked or drifted, busy)
         if self._bounded.tidy():
             give_back()
         self._answer_when_due(sensed.stamp_ns, False, busy)
@@ -195,7 +198,10 @@ class GraphLoop:
                 self._answer, stamp_ns=stamp_ns, decisions=decisions, last_tie_ns=self.engine.boards.last_seen_ns()
             )
         self._answer = replace(
-            self._answer, counts=self._counted(), cpu_s=time.process_time(), suspects=self._knocks.suspects
+            self._answer,
+            counts=self._counted(),
+            cpu_s=time.process_time(),
+            suspects=(*self._knocks.suspects, *self._drift.suspects),
         )
         self._tell(self._answer)
         return self._answer

@@ -26,7 +26,11 @@ def solve(task: GraphTask, inbox: Any, out: Any) -> None:
     if not task.patient:
         give_way(GRAPH_NICE)
     try:
-        loop = _started(task, out, task.prior)
+        try:
+            loop = _started(task, out, task.prior)
+        except SurecutError as error:
+            out.put(Died("graph", str(error), refusal=True))
+            return
         out.put(Ready("graph"))
         while True:
             try:

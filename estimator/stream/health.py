@@ -198,7 +198,7 @@ class Monitor:
             return []
         faults = []
         if self._astray:
-            text = "the camera has not found its place in the map of the earlier run; show it a board"
+            text = "the camera has not found its place in the earlier map; show it a board, or what it saw then"
             faults.append(("relocalising", text, Severity.WARNING))
         for row in answer.calibration:
             off = abs(row.value - row.prior) / row.prior_sigma

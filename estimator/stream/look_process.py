@@ -79,16 +79,16 @@ class LookLoop(FrontEnd):
                 picks = len(clicks)
                 self._late(clicks)
             else:
-                outlines = self._present(items, tracked.frame)
+                outlines = self._present(items, tracked)
         except SurecutError as error:
             problem, bad = " ".join(str(error).split()), unreadable(items)
         cpu_s = time.process_time() - began
         thinned = self._thinning.taken()
         self._out.put(Worked(outlines, stamp_ns, problem, picks, cpu_s, unreadable=bad, thinned=thinned))
 
-    def _present(self, items: list[Item], frame: StereoFrame | None) -> dict[str, tuple[Outline, ...]]:
+    def _present(self, items: list[Item], tracked: Tracked) -> dict[str, tuple[Outline, ...]]:
         self._note(items)
-        sensed = self._sensing.look(items, frame)
+        sensed = self._sensing.look(items, tracked.frame, memorable=tracked.memorable)
         self._remember(sensed.bundle.frame)
         self._hand_on(sensed)
         del self._sensing.sensors.rejected[:-REFUSALS]

@@ -1,13 +1,15 @@
-"""What survives a restart: boards, machine, calibration, pipes and points, with their joint covariance, as JSON.
+"""What survives a restart: boards, machine, calibration, pipes and points, and the surest landmarks, with their joint
+covariance, as JSON.
 
 Everything else in the graph is eliminated into one Gaussian over these. It stays in the same {o}, so that {b} and the
-points keep their numbers; the camera has to find itself again by a board.
+points keep their numbers; the camera has to find itself again by a board, or by the landmarks, whose patches are kept
+(`album.py`). As they come with the joint, seeing one again counts against what was measured before exactly as in a run
+without a break: nothing is used twice.
 """
 
-import base64
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +21,30 @@ from ...factors import keys
 from ...factors.camera import CameraModel
 from ...factors.errors import LogError, SurecutError
 from ...factors.rig import Pipe
+from ...frontends.stereo.atlas import Atlas
 from ...io.reader import LogReader
 from ..batch import BatchSolution
 from ..engine import Engine
 from ..graph import Record, Update
 from ..marginal import FAMILY, WIDTHS, GaussianPrior, gaussian_of, value_of
+from ..observability import Undetermined, determined
 from ..output_files import write_text
 from ..pipe_parts import known_cylinder, known_point
-from .remembered import KEY, to_data
+from ..track_gate import AWAY
+from .memory_atlas import from_data as atlas_from_data
+from .memory_atlas import packed, unpacked
+from .memory_atlas import to_data as atlas_to_data
+from .remembered import KEY, LARGEST_BYTES, to_data
 from .variables import LONG_LIVED, long_lived
 from .wire import Answer
 
 Float = NDArray[np.float64]
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats; the first knew no landmarks."""
+JOINT_LANDMARKS = 100
+"""The joint of all that is kept is dense: a megabyte with so many, a fiftieth of a second for each update."""
 MARK, HEAD = '"surecut_memory"', 40
 """What a checkpoint begins with, and within how many characters."""
 
@@ -59,6 +71,12 @@ class Memory:
     inset_sigma_px: list[tuple[str, str, float]]
     cylinders: list[str]
     """Pipes that the machine's depth camera has seen."""
+    atlas: Atlas = field(default_factory=Atlas)
+    """By which the front end finds its way."""
+    laid: list[int] = field(default_factory=list)
+    """Landmarks on surfaces that the machine's depth camera has seen."""
+    shared: list[tuple[int, int, int]] = field(default_factory=list)
+    """How many share the distortion of a part of its view: see `Surfaces`."""
 
 
 def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | None:
@@ -69,10 +87,9 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
     """
     if not engine.boards.any_known() or engine.graph.unsolved:
         return None
-    if solution is None:
-        prior = engine.solver.joint_gaussian(long_lived(engine.solver.values()))
-    else:
-        prior = gaussian_of(solution.at.graph(), solution.values, long_lived(solution.values))
+    atlas, prior = _joint(engine, solution)
+    landmarks = {keys.index(key) for key in prior.keys if keys.kind(key) == "l"}
+    laid, shared = engine.surfaces.laid()
     return Memory(
         stamp_ns=engine.end_ns,
         keyframes=len(engine.odometry.keyframe_stamps),
@@ -114,7 +131,36 @@ def remember(engine: Engine, solution: BatchSolution | None = None) -> Memory | 
         distances_open=[engine.rig.distances.index(d) for d in engine.distances.open],
         inset_sigma_px=[(*key, sigma) for key, sigma in engine.boards.corners.inset_sigma_px.items()],
         cylinders=sorted(_seen_by_machine(engine)),
+        atlas=atlas,
+        laid=sorted(laid & landmarks),
+        shared=[(x, y, count) for (x, y), count in shared.items()],
     )
+
+
+def _joint(engine: Engine, solution: BatchSolution | None) -> tuple[Atlas, GaussianPrior]:
+    """What is known of all that is kept, and by what the landmarks among it are found again.
+
+    Raises:
+        ObservabilityError: something else than a landmark is not determined.
+    """
+    values = engine.solver.values() if solution is None else solution.values
+    views = {
+        t: n
+        for t, n in engine.odometry.observations.items()
+        if values.exists(keys.landmark(t)) and not engine.adrift.holds(keys.landmark(t))
+    }
+    while True:
+        atlas, joint = engine.album.chosen(views, JOINT_LANDMARKS)
+        stay = [*long_lived(values), *map(keys.landmark, joint)]
+        try:
+            if solution is None:
+                return atlas, engine.solver.joint_gaussian(stay)
+            with determined():
+                return atlas, gaussian_of(solution.at.graph(), values, stay)
+        except Undetermined as error:
+            if error.key not in stay or keys.kind(error.key) != "l":
+                raise
+            del views[keys.index(error.key)]
 
 
 def recall(engine: Engine, memory: Memory) -> None:
@@ -150,7 +196,19 @@ def recall(engine: Engine, memory: Memory) -> None:
         given = next((p for p in engine.rig.pipes if p.id == stored["id"]), Pipe(id=stored["id"]))
         engine.pipes.cylinders[stored["id"]] = known_cylinder(stored["index"], given, stored["outlines"])
     engine.depth_pipes.remembered = {(pipe, engine.base) for pipe in memory.cylinders}
+    _recall_landmarks(engine, memory)
     engine.resume(update, memory.keyframes, memory.mounted, [engine.rig.distances[i] for i in memory.distances_open])
+
+
+def _recall_landmarks(engine: Engine, memory: Memory) -> None:
+    """Those of the joint are landmarks again as soon as they are seen; they count as away until then."""
+    tracks = memory.atlas.tracks
+    views = dict(zip(tracks.ids.tolist(), tracks.views.tolist(), strict=True))
+    there = [keys.index(key) for key in memory.prior.keys if keys.kind(key) == "l"]
+    engine.odometry.observations = {t: views.get(t, 0) for t in there}
+    engine.odometry.seen_in = dict.fromkeys(there, memory.keyframes - 1 - AWAY)
+    engine.surfaces.recall(set(memory.laid), {(x, y): count for x, y, count in memory.shared})
+    engine.album.recall(memory.atlas)
 
 
 def _seen_by_machine(engine: Engine) -> set[str]:
@@ -181,6 +239,8 @@ def load(path: Path) -> Memory:
             with LogReader(path) as reader:
                 text = (reader.attachment("result.json") or b"").decode("utf-8")
         else:
+            if path.stat().st_size > LARGEST_BYTES:
+                raise MemoryFileError(f"{path}: is larger than {LARGEST_BYTES >> 20} MB; remove it")
             text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError, LogError) as error:
         raise MemoryFileError(f"{path}: cannot be read ({error}); remove it to start without memory") from error
@@ -196,7 +256,7 @@ def _of_result(text: str, name: str) -> str:
         if "trajectory" not in data:
             return text
         found = str(data.get("memory", ""))
-    except (ValueError, AttributeError, TypeError):
+    except (ValueError, AttributeError, TypeError, RecursionError):
         return text
     if not found:
         raise MemoryFileError(f"{name}: holds no memory of boards and machine; run `surecut optimise` again")
@@ -213,8 +273,8 @@ def to_json(memory: Memory, rig_sha256: str, answer: Answer | None = None) -> st
         "variables": [
             {"kind": keys.kind(k), "index": keys.index(k), "value": _numbers(prior.at, k)} for k in prior.keys
         ],
-        "information": _packed(prior.H),
-        "vector": _packed(prior.g),
+        "information": packed(prior.H, "<f8"),
+        "vector": packed(prior.g, "<f8"),
         "cameras": [_camera(c) for c in memory.cameras.values()],
         "boards": memory.boards,
         "points": memory.points,
@@ -223,6 +283,9 @@ def to_json(memory: Memory, rig_sha256: str, answer: Answer | None = None) -> st
         "distances_open": memory.distances_open,
         "inset_sigma_px": memory.inset_sigma_px,
         "cylinders": memory.cylinders,
+        "atlas": atlas_to_data(memory.atlas),
+        "laid": memory.laid,
+        "shared": memory.shared,
     }
     if answer is not None:
         body[KEY] = to_data(answer)
@@ -236,20 +299,21 @@ def from_json(text: str, name: str = "checkpoint") -> Memory:
     """
     try:
         data = json.loads(text)
-        if data["surecut_memory"] != FORMAT:
-            raise MemoryFileError(f"{name}: is of format {data['surecut_memory']}, this one reads {FORMAT}; remove it")
+        if data["surecut_memory"] not in READABLE:
+            found = data["surecut_memory"]
+            raise MemoryFileError(f"{name}: is of format {found}, this one reads up to {FORMAT}; remove it")
         variables = [
             (gtsam.symbol(str(v["kind"])[:1], int(v["index"])), v["kind"], v["value"]) for v in data["variables"]
         ]
-        if any(kind not in LONG_LIVED for _, kind, _ in variables):
+        if any(kind not in LONG_LIVED and kind != "l" for _, kind, _ in variables):
             raise ValueError("a kind of variable that does not live on")
         at = gtsam.Values()
         for key, kind, value in variables:
             at.insert(key, _value(str(kind), np.array(value, float)))
         widths = tuple(WIDTHS[str(kind)] for _, kind, _ in variables)
         size = sum(widths)
-        H = _unpacked(data["information"]).reshape(size, size)
-        g = _unpacked(data["vector"]).reshape(size)
+        H = unpacked(data["information"], "<f8", (size, size))
+        g = unpacked(data["vector"], "<f8", (size,))
         if not (np.isfinite(H).all() and np.isfinite(g).all()):
             raise ValueError("numbers that are not finite")
         prior = GaussianPrior(tuple(key for key, _, _ in variables), widths, H, g, at)
@@ -259,8 +323,11 @@ def from_json(text: str, name: str = "checkpoint") -> Memory:
             int(data["stamp_ns"]), int(data["keyframes"]), prior, cameras, data["boards"], data["points"],
             data["pipes"], bool(data["mounted"]), [int(i) for i in data["distances_open"]], insets,
             [str(pipe) for pipe in data["cylinders"]],
+            atlas_from_data(data["atlas"]) if "atlas" in data else Atlas(),
+            [int(track) for track in data.get("laid", ())],
+            [(int(x), int(y), int(count)) for x, y, count in data.get("shared", ())],
         )  # fmt: skip
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         what = " ".join(str(error).split())[:120]
         raise MemoryFileError(f"{name}: is no checkpoint ({what}); remove it to start without memory") from error
 
@@ -278,14 +345,6 @@ def _value(kind: str, numbers: Float) -> gtsam.Pose3 | gtsam.Cal3DS2 | Float:
     if kind in "fbe":
         return gtsam.Pose3(numbers.reshape(4, 4))
     return gtsam.Cal3DS2(numbers) if kind == "k" else numbers.reshape(WIDTHS[kind])
-
-
-def _packed(array: Float) -> str:
-    return base64.b64encode(np.ascontiguousarray(array, "<f8").tobytes()).decode()
-
-
-def _unpacked(text: str) -> Float:
-    return np.frombuffer(base64.b64decode(text, validate=True), "<f8").astype(float)
 
 
 def _camera(camera: CameraModel) -> dict[str, Any]:

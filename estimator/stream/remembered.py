@@ -17,6 +17,8 @@ from .wire import Answer, Place
 
 Float = NDArray[np.float64]
 
+LARGEST_BYTES = 1 << 28
+"""Of a checkpoint."""
 KEY = "answer"
 """Where it is in the checkpoint."""
 
@@ -50,9 +52,11 @@ def to_data(answer: Answer) -> dict[str, Any]:
 def remembered(checkpoint: Path, rig: Rig) -> Answer | None:
     """What was answered last with this rig; None where the file does not say. The graph tells what is wrong with it."""
     try:
+        if checkpoint.stat().st_size > LARGEST_BYTES:
+            return None
         data = json.loads(checkpoint.read_text(encoding="utf-8"))
         return _answer(data[KEY]) if data["rig_sha256"] == sha256_of(rig) else None
-    except (OSError, KeyError, TypeError, ValueError):
+    except (OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError):
         return None
 
 

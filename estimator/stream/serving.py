@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 
 from ...factors.rig import Rig
+from ...frontends.stereo.atlas import Atlas
 from ...io.messages import Message
 from ..sensing import Sensing
 from .parent import end_with_parent, give_way, keep_loaded
@@ -24,6 +25,7 @@ class FrontEnd(ABC):
         onward: queue of the next process.
         out: line to the parent.
         calibrations: messages by topic that a fresh start has to be told again.
+        atlas: what an earlier run saw.
     """
 
     def __init__(
@@ -34,9 +36,10 @@ class FrontEnd(ABC):
         onward: Any,
         out: Any,
         calibrations: Mapping[str, Message] | None = None,
+        atlas: Atlas | None = None,
     ) -> None:
         self._settings = settings
-        self._sensing = Sensing(rig)
+        self._sensing = Sensing(rig, atlas)
         self._thinning = Thinning(onward, settings, patient)
         self._onward = onward
         self._out = out

@@ -41,6 +41,8 @@ RESTARTS = 5
 """More within a minute: the fault does not go away by itself."""
 FINISH_S = 120.0
 START_S = 120.0
+LAST_WORDS_S = 1.0
+"""What a process says of its death comes by a thread of its own."""
 START_PUBLISH_S = 0.1
 """While the processes start, what is known is published so often."""
 
@@ -94,6 +96,10 @@ class Stream:
         self._ready: set[str] = set()
         self._all_ready = threading.Event()
         self._deaths: list[float] = []
+        self._died = threading.Event()
+        """A process has said what it died of."""
+        self._refused = False
+        """It was what it was given to begin with."""
         self.problem: str | None = None
         """Why the stream ended, where it should not have."""
         self.latency = Latencies()
@@ -151,9 +157,9 @@ class Stream:
             self._publish(None)
             dead = None if starting.is_alive() else self._children.dead()
             if dead is not None or time.monotonic() > until:
-                raise SurecutError(
-                    f"the {dead or 'processes'} did not start; {self.last_problem or 'is there memory?'}"
-                )
+                self._died.wait(LAST_WORDS_S)
+                why = self.last_problem or "is there memory?"
+                raise SurecutError(why if self._refused else f"the {dead or 'processes'} did not start; {why}")
         starting.join()
 
     def stop(self) -> None:
@@ -244,6 +250,10 @@ class Stream:
         self._deaths = [t for t in self._deaths if now - t < 60.0] + [now]
         self._count("restarts")
         self.last_problem = self.last_problem or why  # a traceback says more than an exit code
+        if self._refused:
+            self.problem = self.last_problem
+            self._stopping.set()
+            return
         if len(self._deaths) > RESTARTS:
             self.problem = f"the {why.strip()} died {len(self._deaths)} times within a minute; report this as a defect"
             self._stopping.set()
@@ -272,7 +282,9 @@ class Stream:
             if len(self._ready) == len(NAMES):
                 self._all_ready.set()
         elif isinstance(said, Died):
-            self.last_problem = f"{said.who}: {said.trace}"
+            self.last_problem = said.trace if said.refusal else f"{said.who}: {said.trace}"
+            self._refused |= said.refusal
+            self._died.set()
             self._count("deaths")
 
     def _framed(self, frame: Frame) -> None:

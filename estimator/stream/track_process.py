@@ -1,6 +1,9 @@
 """The tracking's process: it does nothing that a pose has to wait for but the pose."""
 
 import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,9 +11,11 @@ from numpy.typing import NDArray
 
 from ...factors.errors import SurecutError
 from ...factors.rig import Rig
-from ...io.messages import CloudBody, DepthBody, ImageBody
+from ...frontends.stereo.atlas import Atlas
+from ...io.messages import CloudBody, DepthBody, ImageBody, Message
 from ...io.pairing import StereoPair
 from ..items import Item, unreadable
+from .memory import MemoryFileError, load
 from .serving import FrontEnd, serve
 from .settings import StreamSettings
 from .wire import Frame, Group, Tracked, Worked
@@ -18,13 +23,30 @@ from .wire import Frame, Group, Tracked, Worked
 Float = NDArray[np.float64]
 
 
-def track(rig: Rig, settings: StreamSettings, patient: bool, inbox: Any, look: Any, out: Any) -> None:
+def track(
+    rig: Rig, settings: StreamSettings, patient: bool, prior: Path | None, inbox: Any, look: Any, out: Any
+) -> None:
     """The process. `inbox`, `look` and `out` are queues between processes.
 
     Args:
         patient: nothing may be left out, however long it takes.
+        prior: checkpoint to begin with; a reset forgets it.
     """
-    serve("tracking", 0, lambda known: TrackLoop(rig, settings, patient, look, out, known), inbox, look, out)
+    begin = [_atlas(prior)]
+
+    def made(known: Mapping[str, Message]) -> TrackLoop:
+        atlas = begin.pop() if begin else None
+        return TrackLoop(rig, settings, patient, look, out, known, atlas)
+
+    serve("tracking", 0, made, inbox, look, out)
+
+
+def _atlas(prior: Path | None) -> Atlas | None:
+    """What can be found again of an earlier run. The graph tells what is wrong with its file."""
+    try:
+        return load(prior).atlas if prior is not None and prior.exists() else None
+    except MemoryFileError:
+        return None
 
 
 class TrackLoop(FrontEnd):
@@ -51,7 +73,7 @@ class TrackLoop(FrontEnd):
         if problem is not None:
             items = [item for item in items if not isinstance(item, StereoPair)]  # it is told once
         if items:
-            self._hand_on(Tracked(items, frame))
+            self._hand_on(Tracked(items, frame, self._sensing.memorable(frame)))
 
     def _early(self, items: list[Item], motion: Float, inliers: int, taken_ns: int) -> None:
         """A keyframe takes many times as long as its motion, on which the pose of the camera waits."""
@@ -71,7 +93,7 @@ class TrackLoop(FrontEnd):
         elif self._thinning.behind() and all(_surfaces_only(item) for item in tracked.items):
             self._out.put(Worked({}, 0, None, 0, 0.0, left_out=len(tracked.items)))
             return
-        self._onward.put(Tracked(tracked.items, frame))
+        self._onward.put(replace(tracked, frame=frame))
 
 
 def _surfaces_only(item: Item) -> bool:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...factors.measurements import Event, StereoFrame
 from ...factors.rig import Rig
+from ...frontends.stereo.atlas import Memorable
 from ...io.live.interfaces import Outline
 from ..decision import Decision
 from ..items import Item
@@ -38,6 +39,8 @@ class Tracked:
     items: list[Item]
     frame: StereoFrame | None
     """None where there is no pair, or none that can be used."""
+    memorable: Memorable | None = None
+    """What it added to what can be found again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +159,8 @@ class Died:
 
     who: str
     trace: str
+    refusal: bool = False
+    """It cannot begin with what it was given, and `trace` says why in one line."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,9 @@ from ...factors.camera import CameraModel
 from ...factors.measurements import StereoFrame
 from ..undistort import distort, undistort
 from . import points
+from .atlas import Atlas, Memorable, settled_tracks
 from .detection import apart, detect
-from .finding import FADING, Finding
+from .finding import FADING, Finding, Found
 from .flow import checked_flow, inside
 from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
 from .keyframes import keyframe_reason
@@ -67,11 +68,26 @@ class StereoFrontEnd:
         self._velocity = np.zeros(6)
         self._surprise_px = np.inf
         """By how much the last flow differed from what constant velocity foretold."""
+        self._own_from = 0
+        """First track id of this run."""
+        self.memorable: Memorable | None = None
+        """What the last pair added to what can be found again."""
 
     @property
     def chain_T_keyframe(self) -> Float:
         """Shape (4, 4): the last keyframe's pose in the front end's own chain, corrected where places come back."""
         return self._chain_T_keyframe.copy()
+
+    def recall(self, atlas: Atlas) -> None:
+        """Before the first pair: begins with what an earlier run saw, as after a loss of sight.
+
+        Until one of its places is seen, the own chain begins so far from all of them that none is taken to be near.
+        """
+        if not atlas:
+            return
+        self.landmarks.recall(atlas.tracks)
+        self._next_id = self._own_from = atlas.next_id()
+        self._chain_T_keyframe[0, 3] = self.finding.recall(atlas.places)
 
     def process(
         self,
@@ -91,8 +107,11 @@ class StereoFrontEnd:
             early: told of a keyframe's motion before the work on it begins, which takes ten times as long.
         """
         pair = prepare(stamp_ns, left, right)
+        self.memorable = None
         if self._last is None:
             self._last = pair
+            if self.finding.apart:
+                return self._recover(pair, np.eye(4))
             return self._restart(pair, np.eye(4), lost=False)
         guess = self._keyframe_T_last @ self._predicted_motion(stamp_ns)
         self._track(self._last, pair, guess)
@@ -339,13 +358,15 @@ class StereoFrontEnd:
         found = self.finding.look_back(view.pair.left, view.pair.stamp_ns)
         if found is None:
             return nothing
-        drifted, self._chain_T_keyframe = self._chain_T_keyframe, found
+        drifted, self._chain_T_keyframe = self._chain_T_keyframe, found.chain_T_this
         tracks, seen, correction = self._seen_again(view)
         if len(tracks) < self.settings.min_inliers:
             self._chain_T_keyframe = drifted
             return nothing
         self._correct_chain(correction)
         self.finding.verified()
+        if found.joins:
+            self._join(self._chain_T_keyframe @ inverse(drifted))
         return tracks, seen
 
     def _correct_chain(self, this_T_corrected: Float) -> None:
@@ -370,7 +391,9 @@ class StereoFrontEnd:
             motion_inliers=inliers,
             lost=lost,
         )
-        self.finding.remember(frame, self._chain_T_keyframe, view.pair.left, tracks.raw_px, tracks.points)
+        pose = self._chain_T_keyframe
+        added = self.finding.remember(frame, pose, view.pair.left, tracks.raw_px, tracks.points)
+        self.memorable = Memorable(settled_tracks(tracks, pose), added)
         return frame
 
     # -- losing and finding --------------------------------------------------------------------------------------
@@ -380,11 +403,27 @@ class StereoFrontEnd:
         assert self._last is not None
         last_T_this = inverse(self._keyframe_T_last) @ guess
         self._end(np.ones(len(self._tracks), dtype=bool))
-        chain_T_this = self.finding.lost(pair.left, self._last.stamp_ns)
-        if chain_T_this is not None:
-            last_T_this = inverse(self._chain_T_keyframe @ self._keyframe_T_last) @ chain_T_this
+        found = self.finding.lost(pair.left, self._last.stamp_ns)
+        if found is not None:
+            last_T_this = self._led_to(found, last_T_this)
         self._velocity = FADING * self._velocity
         return self._restart(pair, last_T_this, lost=True)
+
+    def _led_to(self, found: Found, predicted: Float) -> Float:
+        """`last_T_this` by a place that was found. Where the own chain joins that of an earlier run, it is the chain
+        that has moved, and the camera as it was predicted."""
+        chain_T_last = self._chain_T_keyframe @ self._keyframe_T_last
+        if not found.joins:
+            return inverse(chain_T_last) @ found.chain_T_this
+        self._join(found.chain_T_this @ inverse(chain_T_last @ predicted))
+        self._chain_T_keyframe = found.chain_T_this @ inverse(self._keyframe_T_last @ predicted)
+        return predicted
+
+    def _join(self, new_T_old: Float) -> None:
+        """The own chain becomes part of an earlier run's."""
+        self.finding.join(new_T_old)
+        self.landmarks.move(self._own_from, new_T_old)
+        self._tracks.patch_poses = new_T_old @ self._tracks.patch_poses
 
     def _restart(self, pair: StereoPair, last_T_this: Float, lost: bool) -> StereoFrame:
         """A keyframe of landmarks seen again and new tracks; no keyframe where the view holds nothing to start from."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..undistort import distort
 from .alignment import Alignment, Patches, PatchGrid, align, make_patches
+from .atlas import AtlasTracks
 from .flow import inside
 from .geometry import Float, StereoGeometry, inverse, project, transform
 from .images import Float32, Picture, smooth
@@ -85,6 +86,21 @@ class LandmarkStore:
         self.ages[rows] = tracks.ages[good]
         self.misses[rows] = 0
         self.tiles[rows] = tracks.crops[good]
+
+    def recall(self, tracks: AtlasTracks) -> None:
+        """Landmarks of an earlier run."""
+        if len(tracks) == 0:
+            return
+        rows = self._rows(len(tracks))
+        for name in ("ids", "points", "patch_points", "patch_poses", "slopes"):
+            getattr(self, name)[rows] = getattr(tracks, name)
+        self.tiles[rows], self.ages[rows], self.misses[rows] = tracks.crops, tracks.views, 0
+
+    def move(self, first_id: int, new_T_old: Float) -> None:
+        """Takes landmarks from an id on to another chain."""
+        rows = np.flatnonzero(self.ids >= first_id)
+        self.points[rows] = transform(new_T_old, self.points[rows])
+        self.patch_poses[rows] = new_T_old @ self.patch_poses[rows]
 
     def _rows(self, n: int) -> NDArray[np.intp]:
         """Rows to write to: freed ones are overwritten as the ring comes round."""

@@ -4,6 +4,7 @@ The thumbnail (Klein and Murray, Improving the agility of keyframe-based SLAM, 2
 matches with P3P consensus decide. Descriptors are computed when somebody is lost, not before.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -11,15 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..undistort import undistort
+from .atlas import AtlasPlace, View
+from .detection import detect
 from .geometry import Float, StereoGeometry
 from .images import Float32, Image
 from .motion import estimate_motion
 from .tracks import Int
 
 _TRIED = 8
+_CERTAIN = 2
+"""So many times the inliers that are needed end the search."""
+_CORNERS = 400
+_SPACING_PX = 5.0
+"""Between corners at 360x240."""
+_RIM_PX = 18
+_RIVALS = 4
+_SAME_PX = 4.0
+"""Features nearer to each other are one."""
+_CLEAR = 0.8
+"""Of the distance to the next best descriptor (Lowe 2004)."""
 ALIKE = 0.8
 """Correlation of thumbnails from which on a place is worth a look while nobody is lost."""
-_THUMBNAIL = (40, 30)
+THUMBNAIL = (40, 30)
+"""Width and height."""
+BEFORE_ALL_NS = -(1 << 61)
+"""Places of an earlier run have stamps before this one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +76,7 @@ class PlaceStore:
         self._capacity = capacity
         self._rig = rig
         self._places: list[Place] = []
-        self._orb = cv2.ORB.create(nfeatures=700, fastThreshold=8, edgeThreshold=18, patchSize=25)
+        self._orb = _orb()
 
     def __len__(self) -> int:
         return len(self._places)
@@ -68,20 +85,38 @@ class PlaceStore:
         """`chain_T_keyframe` of the place with that stamp."""
         return next(place.chain_T_keyframe for place in self._places if place.stamp_ns == stamp_ns)
 
-    def add(self, stamp_ns: int, pose: Float, left: Image, ids: Int, raw_px: Float, points: Float) -> None:
-        """Remembers a keyframe unless a better one with about the same view is there."""
+    def recall(self, places: Sequence[AtlasPlace]) -> None:
+        """Views of an earlier run, older than any of this one."""
+        for k, seen in enumerate(places):
+            nowhere, every = np.full((len(seen.ids), 2), np.nan), np.arange(len(seen.ids), dtype=np.intp)
+            stamp_ns, left = BEFORE_ALL_NS - len(places) + k, np.zeros((0, 0), np.uint8)
+            place = Place(stamp_ns, seen.chain_T_keyframe, left, seen.thumbnail, seen.ids, nowhere, seen.points)
+            place.descriptors, place.described = seen.descriptors, every
+            self._places.append(place)
+
+    def move(self, new_T_old: Float) -> None:
+        """Takes the places of this run to another chain."""
+        for place in self._places:
+            if place.stamp_ns >= BEFORE_ALL_NS:
+                place.chain_T_keyframe = new_T_old @ place.chain_T_keyframe
+
+    def add(self, stamp_ns: int, pose: Float, left: Image, ids: Int, raw_px: Float, points: Float) -> View | None:
+        """Remembers a keyframe unless a better one with about the same view is there; what was remembered."""
         known = np.isfinite(points).all(axis=1)
         if known.sum() < 25:
-            return
+            return None
+        view = View(pose.copy(), left, ids[known], raw_px[known], points[known])
         place = Place(stamp_ns, pose.copy(), left, _thumbnail(left), ids[known], raw_px[known], points[known])
         near = self._same_view(pose, 0.1 * float(np.median(points[known, 2])))
         if near is not None:
-            if len(self._places[near].ids) < 0.7 * len(place.ids):
-                self._places[near] = place
-            return
+            if len(self._places[near].ids) >= 0.7 * len(place.ids):
+                return None
+            self._places[near] = place
+            return view
         self._places.append(place)
         if len(self._places) > self._capacity:
             del self._places[min(range(len(self._places) - 1), key=lambda index: len(self._places[index].ids))]
+        return view
 
     def _same_view(self, pose: Float, distance_m: float) -> int | None:
         """The first place within a distance and nine degrees of a pose."""
@@ -93,21 +128,21 @@ class PlaceStore:
         near = np.flatnonzero((apart < distance_m) & (cosine > np.cos(0.15)))
         return int(near[0]) if len(near) else None
 
-    def find(self, left: Image, min_inliers: int) -> list[Relocalisation]:
-        """Places that the left image shows, the one with most inliers first."""
-        if not self._places:
+    def find(self, left: Image, min_inliers: int, before_ns: int | None = None) -> list[Relocalisation]:
+        """Places, or those of before, that the left image shows, the one with most inliers first."""
+        places = [place for place in self._places if before_ns is None or place.stamp_ns < before_ns]
+        if not places:
             return []
         picture = _thumbnail(left).ravel()
-        likeness = np.array([float(place.thumbnail.ravel() @ picture) for place in self._places])
-        keypoints, descriptors = self._orb.detectAndCompute(left, None)
-        if descriptors is None or len(keypoints) < min_inliers:
-            return []
-        raw = np.array([point.pt for point in keypoints], dtype=np.float64)
+        likeness = np.array([float(place.thumbnail.ravel() @ picture) for place in places])
+        raw, descriptors = self._features(left)
         found = []
         for index in np.argsort(-likeness, kind="stable")[:_TRIED]:
-            match = self._verify(self._places[int(index)], raw, np.asarray(descriptors, np.uint8), min_inliers)
+            match = self._verify(places[int(index)], raw, descriptors, min_inliers)
             if match is not None:
                 found.append(match)
+            if match is not None and match.inliers >= _CERTAIN * min_inliers:
+                break
         return sorted(found, key=lambda match: -match.inliers)
 
     def look_back(self, left: Image, before_ns: int, min_inliers: int, alike: float = ALIKE) -> Relocalisation | None:
@@ -123,36 +158,35 @@ class PlaceStore:
         best = int(np.argmax(likeness))
         if likeness[best] < alike:
             return None
+        return self._verify(old[best], *self._features(left), min_inliers)
+
+    def _features(self, left: Image) -> tuple[Float, Image]:
+        """Raw pixels (n, 2) and descriptors (n, 32) of corners like those of the tracks, and of ORB's own for views
+        from nearer or farther."""
+        spacing = _SPACING_PX * float(np.hypot(*left.shape)) / 432.7
+        corners = detect(left, np.zeros((0, 2)), _CORNERS, spacing, _RIM_PX, 1.0)
+        own, rows = _described(self._orb, left, corners)
         keypoints, descriptors = self._orb.detectAndCompute(left, None)
-        if descriptors is None or len(keypoints) < min_inliers:
-            return None
+        if descriptors is None or len(keypoints) == 0:
+            return corners[rows], own
         raw = np.array([point.pt for point in keypoints], dtype=np.float64)
-        return self._verify(old[best], raw, np.asarray(descriptors, np.uint8), min_inliers)
+        return np.concatenate((corners[rows], raw)), np.concatenate((own, np.asarray(descriptors, np.uint8)))
 
     def _describe(self, place: Place) -> tuple[Image, NDArray[np.intp]]:
         """Descriptors at the place's landmarks; those too near the rim have none."""
         if place.descriptors is None or place.described is None:
-            keypoints = []
-            for index, (u, v) in enumerate(place.raw_px.tolist()):
-                angle = _angle(place.left, u, v)
-                keypoints.append(cv2.KeyPoint(u, v, 25.0, angle, 1.0, 0, index))
-            kept, descriptors = self._orb.compute(place.left, keypoints)
-            place.descriptors = (
-                np.zeros((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors, np.uint8)
-            )
-            place.described = np.array([point.class_id for point in kept], dtype=np.intp)
+            place.descriptors, place.described = _described(self._orb, place.left, place.raw_px)
         return place.descriptors, place.described
 
     def _verify(self, place: Place, raw: Float, descriptors: Image, min_inliers: int) -> Relocalisation | None:
         theirs, described = self._describe(place)
         if len(theirs) < min_inliers:
             return None
-        pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(theirs, descriptors, k=2)
-        good = [(p[0].queryIdx, p[0].trainIdx) for p in pairs if len(p) == 2 and p[0].distance < 0.8 * p[1].distance]
-        if len(good) < min_inliers:
+        theirs_rows, ours = _matches(theirs, raw, descriptors)
+        if len(ours) < min_inliers:
             return None
-        rows = described[[a for a, _ in good]]
-        here = undistort(self._rig.left, raw[[b for _, b in good]])[0]
+        rows = described[theirs_rows]
+        here = undistort(self._rig.left, raw[ours])[0]
         ok = np.isfinite(here).all(axis=1)
         return self._consensus(place, rows[ok], here[ok], min_inliers)
 
@@ -176,19 +210,56 @@ class PlaceStore:
         )
 
 
+def place_of(view: View) -> AtlasPlace:
+    """A view as it can be recognised without its picture."""
+    descriptors, rows = _described(_orb(), view.left, view.raw_px)
+    return AtlasPlace(view.chain_T_keyframe, _thumbnail(view.left), view.ids[rows], view.points[rows], descriptors)
+
+
+def _orb() -> cv2.ORB:
+    return cv2.ORB.create(nfeatures=700, fastThreshold=8, edgeThreshold=18, patchSize=25)
+
+
+def _described(orb: cv2.ORB, left: Image, raw_px: Float) -> tuple[Image, NDArray[np.intp]]:
+    """Descriptors (n, 32) at given pixels, and whose they are; those too near the rim have none."""
+    angles = _angles(left, raw_px).tolist()
+    keypoints = [
+        cv2.KeyPoint(u, v, 25.0, angle, 1.0, 0, index)
+        for index, ((u, v), angle) in enumerate(zip(raw_px.tolist(), angles, strict=True))
+    ]
+    kept, descriptors = orb.compute(left, keypoints)
+    found = np.zeros((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors, np.uint8)
+    return found, np.array([point.class_id for point in kept], dtype=np.intp)
+
+
+def _matches(theirs: Image, raw: Float, descriptors: Image) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of descriptors that are nearest to each other, and nearer than to any of another place in the image."""
+    if len(descriptors) <= _RIVALS:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    found = cv2.batchDistance(theirs, descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=_RIVALS)
+    distance, index = np.asarray(found[0], np.int64), np.asarray(found[1], np.intp)
+    elsewhere = np.linalg.norm(raw[index[:, 1:]] - raw[index[:, :1]], axis=2) > _SAME_PX
+    rival = np.where(elsewhere, distance[:, 1:], np.iinfo(np.int64).max).min(axis=1)
+    good = distance[:, 0] < _CLEAR * rival
+    return np.flatnonzero(good), index[good, 0]
+
+
 def _thumbnail(image: Image) -> Float32:
-    small = cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, THUMBNAIL, interpolation=cv2.INTER_AREA)
     small = np.asarray(cv2.GaussianBlur(small, (0, 0), 1.0), np.float32)
     small = small - small.mean()
     return small / max(float(np.linalg.norm(small)), 1e-6)
 
 
-def _angle(image: Image, u: float, v: float, radius: int = 12) -> float:
-    """Direction of the intensity centroid in degrees (Rublee et al. 2011), as ORB's own detector sets it."""
-    x, y = round(u), round(v)
-    window = image[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1].astype(np.float64)
-    rows, columns = np.mgrid[: window.shape[0], : window.shape[1]]
-    dx, dy = columns - (x - max(x - radius, 0)), rows - (y - max(y - radius, 0))
-    round_window = dx**2 + dy**2 <= radius**2
-    moment = (float((window * dx)[round_window].sum()), float((window * dy)[round_window].sum()))
-    return float(np.degrees(np.arctan2(moment[1], moment[0])) % 360.0)
+def _angles(image: Image, raw_px: Float, radius: int = 12) -> Float:
+    """Directions (n,) of the intensity centroids in degrees (Rublee et al. 2011), as ORB's own detector sets them."""
+    if len(raw_px) == 0:
+        return np.zeros(0)
+    padded = np.pad(image, radius)
+    rows, columns = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    within = rows**2 + columns**2 <= radius**2
+    dx, dy = columns[within], rows[within]
+    x, y = np.rint(raw_px).astype(np.intp).T
+    x, y = np.clip(x, 0, image.shape[1] - 1) + radius, np.clip(y, 0, image.shape[0] - 1) + radius
+    values = padded[y[:, None] + dy, x[:, None] + dx].astype(np.float64)
+    return np.asarray(np.degrees(np.arctan2(values @ dy, values @ dx)) % 360.0, dtype=np.float64)
