@@ -29,6 +29,9 @@ REACH = 5.0
 SHORT_S = 0.2
 """A gap in which the camera cannot have gone far: its landmarks lie near enough to where they are taken to be."""
 
+MOST_TOLD = 100
+"""Lost parts of the way that a run without end remembers to tell."""
+
 
 class Adrift:
     """The parts of the map of which only the shape is known: *strands*, each begun by a loss of sight.
@@ -43,6 +46,8 @@ class Adrift:
         self._graph, self._odometry, self._boards = graph, odometry, boards
         self._open: Strand | None = None
         self._loose: list[Strand] = []
+        self._past: list[Event] = []
+        """Of strands that have left the graph."""
         self._fresh = False
         """Does the frame that becomes a keyframe hang together with nothing?"""
         self._expected = gtsam.Pose3()
@@ -155,6 +160,13 @@ class Adrift:
             if like in strand.own:
                 strand.own.update(new)
 
+    def forget(self, gone: Iterable[int]) -> None:
+        """These have left the graph: a strand of which nothing is left is past."""
+        for strand in self.strands:
+            strand.own.difference_update(gone)
+        self._past = [*self._past, *(_told(strand) for strand in self._loose if not strand.own)][-MOST_TOLD:]
+        self._loose = [strand for strand in self._loose if strand.own]
+
     # Strands --------------------------------------------------------------------------------------------------
 
     def _put_aside(self) -> None:
@@ -183,7 +195,7 @@ class Adrift:
     def _carry(self, strand: Strand, correction: gtsam.Pose3) -> None:
         """All of a strand, moved in {o}; the solver begins anew from there, with what is seen now."""
         self._graph.flush()
-        self._graph.relocate(strand.moved(self._graph.solver.values(), correction))
+        self._graph.relocate(strand.moved(self._graph.solver.values(), correction), strand.own, correction)
 
     # What a frame shows ---------------------------------------------------------------------------------------
 
@@ -213,13 +225,14 @@ class Adrift:
 
     def told(self) -> list[Event]:
         """Parts of the way that were never found to lie anywhere."""
-        events = []
-        for strand in self.strands:
-            seconds = (strand.last_ns - strand.lost_ns) * 1e-9
-            text = (
-                f"the mobile camera lost sight, and for {seconds:.1f} s saw nothing that it had seen before or saw "
-                "later: its way there hangs on a motion prior alone, and clicks there do not count; go on from places "
-                "that have been seen, or show it a board"
-            )
-            events.append(Event(strand.lost_ns, "sight_lost", text, "warning", {"seconds": seconds}))
-        return events
+        return [*self._past, *(_told(strand) for strand in self.strands)]
+
+
+def _told(strand: Strand) -> Event:
+    seconds = (strand.last_ns - strand.lost_ns) * 1e-9
+    text = (
+        f"the mobile camera lost sight, and for {seconds:.1f} s saw nothing that it had seen before or saw later: its "
+        "way there hangs on a motion prior alone, and clicks there do not count; go on from places that have been seen "
+        "or show it a board"
+    )
+    return Event(strand.lost_ns, "sight_lost", text, "warning", {"seconds": seconds})

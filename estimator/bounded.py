@@ -55,9 +55,15 @@ class Bounded:
         return False
 
     def _poses(self, first: int) -> set[int]:
-        """Keyframes before `first`, but for those on which something hangs that has not entered yet."""
-        held, state = self.engine.held_keyframes(), self.engine.state
-        return {k for i in range(self.first, first) if (k := keys.keyframe(i)) not in held and state.has(k)}
+        """Keyframes before `first`, but for those on which something hangs that has not entered yet.
+
+        Nor those that are adrift, unless they are too many: what has left cannot be turned by a radian any more.
+        """
+        engine = self.engine
+        every = {k for k in engine.state.values.keys() if keys.kind(k) == "x"}
+        adrift = {k for k in every if engine.adrift.holds(k)}
+        held = engine.held_keyframes() | (adrift if len(adrift) <= self.limits.keyframes else set())
+        return {k for k in every - held if keys.index(k) < first}
 
     def _forget(self, first: int) -> None:
         """All keyframes before `first` leave that can."""

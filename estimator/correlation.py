@@ -30,8 +30,8 @@ Bool = NDArray[np.bool_]
 Active = list[tuple[int, gtsam.NonlinearFactor, Record]]
 """Factors with their index in the log and their record."""
 
-LAGS = 7
-"""Keyframes apart up to which residuals of one track are compared."""
+LAGS, FEWEST_LAGS = 7, 2
+"""Keyframes apart up to which residuals of one track are compared, where tracks are long enough; and at least."""
 PERSISTENCE = (0.0, 0.5, 0.8)
 """Correlation of neighbours in the kinds of error: white, over two keyframes, over five."""
 KINDS = tuple(product(PERSISTENCE, (False, True)))
@@ -47,7 +47,7 @@ MOTIONS = 12
 PART = 0.6
 """Size of a part of the scene whose tracks may be wrong together, as a share of their typical distance."""
 FEWEST_PAIRS = 300
-"""Pairs of residuals, `LAGS` apart, that tell."""
+"""Pairs of residuals, so many keyframes apart, that tell."""
 SEGMENT = 16
 """Views of a track whose errors are taken to be correlated: longer tracks are several of them."""
 CAMERAS = ("m_left", "m_right")
@@ -79,7 +79,7 @@ def correlate(
         least: what tracks must contribute to motions, over what their own covariance says, for the latter to hold.
     """
     tracks = Tracks(active, family)
-    if len(tracks.track) == 0 or int((tracks.track[LAGS:] == tracks.track[:-LAGS]).sum()) < FEWEST_PAIRS:
+    if tracks.lags < FEWEST_LAGS:
         return None
     variances = components(tracks, system)
     own, neighbours = variances[:-1], variances[-1]
@@ -254,6 +254,9 @@ class Tracks:
         """Shape (n,), one entry for every keyframe of every track."""
         self.place: Int = np.array([i for seen in views.values() for i in range(len(seen))], dtype=np.int64)
         """Shape (n,), number of the keyframe in its track."""
+        pairs = [int((self.track[lag:] == self.track[:-lag]).sum()) for lag in range(1, LAGS + 1)]
+        self.lags = sum(n >= FEWEST_PAIRS for n in pairs)
+        """Keyframes apart up to which there are residuals enough to compare."""
         factor = [seen[stamp] for seen in views.values() for stamp in sorted(seen)]
         self._factor: Int = np.array(factor, dtype=np.int64).reshape(-1, 2)
         self.seen: Bool = self._factor >= 0
@@ -301,7 +304,7 @@ class Tracks:
         """
         means, counts = [], []
         for other in (False, True):
-            for lag in range(LAGS + 1):
+            for lag in range(self.lags + 1):
                 last = len(own) - lag
                 late, seen = (own[lag:, ::-1], self.seen[lag:, ::-1]) if other else (own[lag:], self.seen[lag:])
                 both = (self.track[lag:] == self.track[:last])[:, None] & seen & self.seen[:last]

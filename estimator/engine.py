@@ -33,7 +33,7 @@ from .machine import Machine
 from .observability import why_no_base
 from .odometry import Odometry, OdometrySettings
 from .open_graph import OpenGraph
-from .open_views import OpenViews
+from .open_views import UNPLACED, OpenViews
 from .pipe_parts import SeenFrom
 from .pipes import Pipes
 from .placement import place, place_by_landmarks
@@ -45,7 +45,6 @@ corners of all of them."""
 
 WAITING_BUNDLES = 200
 """Frames without a known board that a run without end keeps."""
-UNPLACED = "the camera's place is unknown, places"
 
 
 class Engine:
@@ -219,8 +218,9 @@ class Engine:
         if not self.adrift.strands:
             return sightings
         apart = {name for name, s in self.boards.sheets.items() if s.known and self.adrift.apart(s.key, key)}
-        for s in [s for s in sightings if s.board in apart]:
-            self.boards.news.refuse(self.boards.sheets[s.board], [s], UNPLACED, 0.0, 1.0)
+        for name in apart:
+            seen = [s for s in sightings if s.board == name]
+            self.boards.news.refuse(self.boards.sheets[name], seen, UNPLACED, 0.0, 1.0)
         return [s for s in sightings if s.board not in apart]
 
     def _camera_poses(self, key: int) -> dict[str, gtsam.Pose3]:
@@ -391,6 +391,7 @@ class Engine:
         landmarks = {keys.index(k) for k in gone if keys.kind(k) == "l"}
         self.keyframe_at = {stamp: i for stamp, i in self.keyframe_at.items() if i not in left}
         self.odometry.forget(left, landmarks)
+        self.adrift.forget(gone)
         self.surfaces.forget(landmarks)
         self.pipes.forget({k for k in gone if keys.kind(k) == "x"})
         self.waiting = self.waiting[-WAITING_BUNDLES:]

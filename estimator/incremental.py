@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..factors import keys
 from .graph import FactorLog, Record, Update
-from .marginal import FAMILY, GaussianPrior, gaussian_of, joint_of, marginal, renamed, without
+from .marginal import FAMILY, GaussianPrior, carried, gaussian_of, joint_of, marginal, renamed, without
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -272,11 +272,17 @@ class Incremental:
         self._slots = [None if i in self.log.off else next(places) for i in range(len(self.log.factors))]
         self._values = self._isam.calculateEstimate()
 
-    def relocate(self, values: gtsam.Values) -> gtsam.Values:
+    def relocate(self, values: gtsam.Values, moved: Collection[int], correction: gtsam.Pose3) -> gtsam.Values:
         """Values that no step would reach, because a part of the map has been found to lie elsewhere.
 
         The next update brings what holds it there; the solver begins anew with that.
+
+        Args:
+            values: with `correction` from the left on what is moved.
         """
+        for index, factor, _ in [row for row in self.log.active() if row[2].family == FAMILY]:
+            if not set(factor.keys()).isdisjoint(moved):
+                self.log.replace(index, carried(joint_of(factor, self._values), moved, correction).factor())
         self._values, self._relocated = values, True
         return gtsam.Values(values)
 

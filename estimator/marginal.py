@@ -130,6 +130,28 @@ def renamed(prior: GaussianPrior, names: Mapping[int, int]) -> GaussianPrior:
     return replace(prior, keys=tuple(names.get(key, key) for key in prior.keys), at=at)
 
 
+def carried(prior: GaussianPrior, moved: Collection[int], correction: gtsam.Pose3) -> GaussianPrior:
+    """The same about variables of which some have been moved together: what it says of their shape goes along.
+
+    Tangents of poses are those of their own axes and stay; those of points turn with {o}.
+
+    Args:
+        correction: from the left on all that is moved.
+    """
+    at, turn = gtsam.Values(), np.eye(len(prior.g))
+    stops = np.cumsum(prior.widths)
+    for key, width, stop in zip(prior.keys, prior.widths, stops, strict=True):
+        value = value_of(prior.at, key)
+        if key in moved and isinstance(value, gtsam.Pose3):
+            value = correction.compose(value)
+        elif key in moved and keys.kind(key) in POINTS:
+            value = correction.transformFrom(prior.at.atPoint3(key))
+            turn[stop - width : stop, stop - width : stop] = correction.rotation().matrix()
+        at.insert(key, value)
+    return replace(prior, H=turn @ prior.H @ turn.T, g=turn @ prior.g, at=at)
+
+
+POINTS = "lzqpuv"
 WIDTHS = {
     "x": 6,
     "f": 6,
@@ -164,6 +186,6 @@ def value_of(values: gtsam.Values, key: int) -> gtsam.Pose3 | gtsam.Cal3DS2 | Fl
     kind = keys.kind(key)
     if kind in "xfbe":
         return values.atPose3(key)
-    if kind in "lzqpuv":
+    if kind in POINTS:
         return values.atPoint3(key)
     return values.atCal3DS2(key) if kind == "k" else values.atVector(key)

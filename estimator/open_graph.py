@@ -1,6 +1,6 @@
 """The graph while it grows: what is believed, what waits for the solver, and the solver."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import gtsam
 import numpy as np
@@ -38,9 +38,13 @@ class OpenGraph:
         self.state.values = self.solver.update(update)
         return True
 
-    def relocate(self, values: gtsam.Values) -> None:
-        """Other values, from which the solver begins anew at the next update; nothing may be waiting."""
-        self.state.values = self.solver.relocate(values)
+    def relocate(self, values: gtsam.Values, moved: Collection[int], correction: gtsam.Pose3) -> None:
+        """Other values, from which the solver begins anew at the next update; nothing may be waiting.
+
+        Args:
+            values: with `correction` from the left on the variables `moved`.
+        """
+        self.state.values = self.solver.relocate(values, moved, correction)
 
     def joint_covariance(self, keys: Sequence[int]) -> NDArray[np.float64]:
         """Joint covariance of some variables with all that has gathered, in the order of `keys`.

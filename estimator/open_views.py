@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 from ..factors.measurements import OutlineSighting, Pick
 
+UNPLACED = "the camera's place is unknown, places"
+"""Why something that it saw does not enter."""
 MOST = 100
 """That a run without end keeps, of each."""
 

@@ -2,8 +2,9 @@
 
 from ..factors import keys
 from ..factors.measurements import Rejection
-from .engine import UNPLACED, Engine
+from .engine import Engine
 from .odometry import FAMILY as ODOMETRY
+from .open_views import UNPLACED
 
 
 def everything_rejected(engine: Engine) -> list[Rejection]:

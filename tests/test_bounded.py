@@ -10,7 +10,7 @@ from surecut.estimator.engine import Engine
 from surecut.estimator.graph import Record, Update
 from surecut.estimator.incremental import Cut, Incremental
 from surecut.estimator.limits import Limits
-from surecut.estimator.marginal import FAMILY, gaussian_of, joint_of, marginal, renamed, without
+from surecut.estimator.marginal import FAMILY, carried, gaussian_of, joint_of, marginal, renamed, without
 from surecut.estimator.observability import Undetermined
 from surecut.estimator.points_in_base import point_blocks
 from surecut.estimator.surfaces import lay_on_surfaces
@@ -164,6 +164,37 @@ def test_renaming_leaves_the_factor_that_it_is_taken_from():
     for key in again.keys:
         moved.insert(before if key == points[4] else key, values.atPoint3(key) + 0.1)
     assert torn.error(moved) == pytest.approx(factor.error(shifted(values, again.keys)), rel=1e-9)
+
+
+def test_what_is_known_of_a_moved_part_goes_along():
+    """Of a pose and points in {o}, seen and moved together: their shape is as well known as before."""
+    _, values, points = linear_graph()
+    graph, camera, pixels = gtsam.NonlinearFactorGraph(), keys.keyframe(0), gtsam.noiseModel.Isotropic.Sigma(2, 0.5)
+    values.insert(camera, gtsam.Pose3(gtsam.Rot3.Rodrigues(0.3, -0.4, 0.2), np.array([0.1, -0.2, -6.0])))
+    for key in points:
+        px = np.random.default_rng(key % 97).normal(0, 30, 2)
+        graph.add(gtsam.GenericProjectionFactorCal3_S2(px, pixels, camera, key, gtsam.Cal3_S2(200, 200, 0, 0, 0)))
+        graph.add(gtsam.PriorFactorPoint3(key, np.ones(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.2)))
+    factor = gaussian_of(graph, values, [camera, *points[:5]]).factor()
+    part = {camera, *points[:3]}
+    correction = gtsam.Pose3(gtsam.Rot3.Rodrigues(0.5, 1.1, -0.7), np.array([1.0, -2.0, 0.5]))
+
+    def off(rng, moved):
+        found = gtsam.Values()
+        steps = rng.normal(0, 0.1, (6, 6))
+        for key, step in zip((camera, *points[:5]), steps, strict=True):
+            if key == camera:
+                pose = values.atPose3(key).retract(step)
+                found.insert(key, correction.compose(pose) if moved else pose)
+            else:
+                point = values.atPoint3(key) + step[:3]
+                found.insert(key, correction.transformFrom(point) if moved and key in part else point)
+        return found
+
+    again = carried(joint_of(factor, values), part, correction).factor()
+    for seed in range(3):
+        here, there = (off(np.random.default_rng(seed), moved) for moved in (False, True))
+        assert again.error(there) == pytest.approx(factor.error(here), rel=1e-6)
 
 
 def shifted(values, wanted):

@@ -27,12 +27,12 @@ class Factor:
         return [keys.keyframe(self._keyframe)]
 
 
-def run(draw, tracks=400, seed=3):
-    """Tracks of 4 to 20 views with drawn errors (views, camera, axis), each with its fitted point (u, v, disparity)."""
+def run(draw, tracks=400, seed=3, longest=20):
+    """Tracks of 4 to `longest` views with drawn errors (views, camera, axis), each with its fitted point (u, v, disparity)."""
     rng = np.random.default_rng(seed)
     active, errors, i, j, data = [], [], [], [], []
     for track in range(tracks):
-        n = int(rng.integers(4, 20))
+        n = int(rng.integers(4, longest))
         px, noise = rng.uniform(0, 300, 2), draw(n, rng)
         for t in range(n):
             for camera, name in enumerate(("m_left", "m_right")):
@@ -99,6 +99,18 @@ def test_mean_of_correlated_values():
     apart = np.abs(np.arange(n)[:, None] - np.arange(n))
     assert mean_factor(rho, np.array([n]))[0] == pytest.approx((rho**apart).sum() / n)
     assert mean_factor(0.0, np.array([SEGMENT]))[0] == 1.0
+
+
+def test_tracks_of_few_keyframes_tell_too():
+    """None is long enough to be compared over seven keyframes; what is alike over three tells."""
+    active, system = run(mixed, tracks=1200, longest=6)
+    tracks = Tracks(active, FAMILY)
+    assert tracks.lags == 4
+    assert correlate(active[:400], None, system, FAMILY) is None
+    found = components(tracks, system)
+    shared = sum(found[k] for k, (rho, both) in enumerate(KINDS) if both and rho > 0)
+    assert shared == pytest.approx(0.4, abs=0.15)
+    assert found.sum(axis=0) == pytest.approx(1.0, abs=0.15)
 
 
 def test_few_pairs_tell_nothing():

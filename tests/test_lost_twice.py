@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from surecut.estimator.bounded import Bounded
 from surecut.estimator.bundle import Bundle
 from surecut.estimator.engine import Engine
+from surecut.estimator.limits import Limits
 from surecut.estimator.refusals import everything_rejected
 from surecut.estimator.run import finish
 from surecut.estimator.surfaces import lay_on_surfaces
+from surecut.factors import keys
 from surecut.factors.camera import CameraModel
 from surecut.factors.measurements import MarkerSighting, Pick, StereoFrame
 from surecut.factors.rig import Board, Marker, Rig
@@ -91,12 +94,13 @@ def dark(engine, stamp_ns):
     return stamp_ns
 
 
-def run(by_board=False, picks_at=(), strange_again=False):
+def run(by_board=False, picks_at=(), strange_again=False, limits=None):
     """Before, strange and again have track names of their own: the front end knows nothing again until the return."""
     rng = np.random.default_rng(4)
     spots = rng.uniform(-1, 1, (6000, 3))
     spots = 2.5 * spots / np.abs(spots).max(axis=1, keepdims=True) * rng.uniform(0.8, 1.0, (6000, 1))
     engine = Engine(rig(), {"m_left": camera("m_left"), "m_right": camera("m_right", BASELINE)}, lay_on_surfaces)
+    bounded = Bounded(engine, limits) if limits else None
     stamp_ns, last, adrift = 0, np.eye(4), []
     for step in range(ROUND if strange_again else END):
         pose = true_pose(step)
@@ -119,8 +123,24 @@ def run(by_board=False, picks_at=(), strange_again=False):
         clicked = tuple(Pick(stamp_ns, "m_left", p, "other", px, px, np.eye(2)) for p, at in picks_at if at == step)
         engine.add(Bundle(stamp_ns, frame, tuple(boards), clicked, {p: (2.0, 0.05) for p, _ in picks_at}))
         adrift.append(bool(engine.adrift))
+        if bounded:
+            bounded.tidy()
     engine.flush()
     return engine, adrift
+
+
+def test_a_run_without_end_keeps_what_is_adrift():
+    engine, adrift = run(True, limits=Limits(keyframes=8, step=4))
+    assert adrift == [False] * STRANGE + [True] * (BACK - STRANGE) + [False] * (END - BACK)
+    poses = {keys.index(key): engine.state.pose(key) for key in engine.state.values.keys() if keys.kind(key) == "x"}
+    assert 0 not in poses
+    assert set(range(STRANGE, AGAIN)) <= poses.keys()
+    for step, pose in poses.items():
+        if STRANGE <= step < AGAIN:
+            continue
+        off = np.linalg.inv(true_pose(step)) @ pose.matrix()
+        assert np.linalg.norm(off[:3, 3]) < 0.025
+        assert Rotation.from_matrix(off[:3, :3]).magnitude() < 0.015
 
 
 def errors(result, step):
