@@ -286,11 +286,6 @@ class Incremental:
         self._values, self._relocated = values, True
         return gtsam.Values(values)
 
-    def adopt(self, values: gtsam.Values) -> gtsam.Values:
-        """The estimate that a copy of this solver has come to; the next update begins anew with it."""
-        self._values, self._relocated = values, True
-        return gtsam.Values(values)
-
     def settle(self, rounds: int = SETTLE_ROUNDS) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.
 
