@@ -6,8 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
+from spoilt_log import rewritten, unchanged
 from stream_process import free_port, lines, started
 
 from surecut.estimator.stream.memory import load
@@ -30,26 +29,6 @@ CHECKPOINT_S, RESTART_S, BOARD_S = 15.0, 21.0, 25.0
 """The process is killed at the first checkpoint after; the log goes on there; until then no board comes into view."""
 NEES95 = 12.59
 """Chi-square of six degrees of freedom."""
-
-
-def cut_out(log, out, begin_ns, end_ns):
-    """The part of a recording between two times, with its attachments."""
-    with log.open("rb") as source, out.open("wb") as target:
-        reader, writer = make_reader(source), Writer(target)
-        writer.start("ros2")
-        for attachment in reader.iter_attachments():
-            writer.add_attachment(
-                attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
-            )
-        schemas, channels = {}, {}
-        for schema, channel, message in reader.iter_messages(starting_at=begin_ns, ending_before=end_ns):
-            if channel.id not in channels:
-                schemas.setdefault(schema.id, writer.register_schema(schema.name, schema.encoding, schema.data))
-                channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, schemas[schema.id]
-                )
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
 
 
 def killed(log, memory):
@@ -86,7 +65,7 @@ def poses(port, seconds, until_ns):
 def test_camera_goes_on_in_the_same_origin_without_a_board(tmp_path):
     log, rest, memory = tmp_path / "whole.mcap", tmp_path / "rest.mcap", tmp_path / "memory.json"
     simulate(log, Scenario.model_validate(SCENE), 5)
-    cut_out(log, rest, stamp_ns(RESTART_S), stamp_ns(BOARD_S + 1.0))
+    rewritten(log, rest, unchanged, stamp_ns(RESTART_S), stamp_ns(BOARD_S + 1.0))
     before = killed(log, memory)
     assert stamp_ns(CHECKPOINT_S) <= before.stamp_ns < stamp_ns(RESTART_S)
     assert len(before.atlas.tracks) > 100
