@@ -60,7 +60,7 @@ def _both_ways(engine: Engine) -> BatchSolution:
         running.stop()
     if dropped != len(solver.dropped):
         return _refined(engine)
-    engine.state.values = solver.relocate(values)
+    engine.state.values = solver.relocate(values, (), gtsam.Pose3())
     return solution
 
 
