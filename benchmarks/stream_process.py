@@ -29,10 +29,14 @@ def free_port() -> int:
         return s.getsockname()[1]
 
 
-def lines(port: int, seconds: float) -> Iterator[dict[str, Any]]:
-    """Updates as they come, for so long; who ends or starts meanwhile is called again."""
+def lines(port: int, seconds: float, process: "subprocess.Popen[bytes] | None" = None) -> Iterator[dict[str, Any]]:
+    """Updates as they come, for so long; who ends or starts meanwhile is called again.
+
+    Args:
+        process: whose end is the end.
+    """
     until = time.monotonic() + seconds
-    while time.monotonic() < until:
+    while time.monotonic() < until and (process is None or process.poll() is None):
         try:
             with socket.create_connection(("127.0.0.1", port), timeout=1) as connection:
                 connection.settimeout(2)

@@ -14,6 +14,7 @@ from surecut.estimator.album import KEPT_PATCHES, KEPT_PLACES, MOST_PATCHES, MOS
 from surecut.estimator.items import wanted_topics
 from surecut.estimator.optimise import rig_of
 from surecut.estimator.sensing import Sensing
+from surecut.estimator.stream.drift import Drift, departure
 from surecut.estimator.stream.graph_loop import GraphLoop
 from surecut.estimator.stream.memory import JOINT_LANDMARKS, MemoryFileError, from_json, recall, remember, to_json
 from surecut.estimator.stream.memory_atlas import from_data, to_data
@@ -149,14 +150,22 @@ def moments(rig, sensing):
 
 
 @pytest.fixture(scope="module")
-def checkpoint(rig):
-    """As a stream wrote it that was killed."""
+def first_life(rig):
+    """A stream that is killed, and the keyframe that it did not see any more."""
     sensing, loop = Sensing(rig), GraphLoop(rig, StreamSettings(), lambda answer: None)
     for at_s, group in moments(rig, sensing):
-        if at_s > ENDS_S:
-            break
-        loop.take(sensing.process(group))
-    memory = remember(loop.engine)
+        sensed = sensing.process(group)
+        if at_s <= ENDS_S:
+            loop.take(sensed)
+        elif sensed.bundle.frame is not None and sensed.bundle.frame.is_keyframe:
+            return loop, sensed.bundle.frame
+    raise AssertionError("no keyframe after the end")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(first_life):
+    """As it was written."""
+    memory = remember(first_life[0].engine)
     assert memory is not None
     return to_json(memory, "")
 
@@ -253,3 +262,37 @@ def test_checkpoint_is_small_and_damage_gives_one_line(rig, checkpoint):
     loop = GraphLoop(rig, StreamSettings(), lambda answer: None)
     recall(loop.engine, old)
     assert loop.engine.astray
+
+
+# A pair that has been knocked -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift_px", [(0.4, 0.0), (-0.4, 0.0), (0.0, 0.4), (3.0, -1.0)])
+def test_pair_that_has_moved_is_told_at_the_next_keyframe(first_life, shift_px):
+    loop, frame = first_life
+    found = departure(loop.engine, replace(frame, right_px=frame.right_px + shift_px))
+    np.testing.assert_allclose(found.shift_px, shift_px, atol=0.1)
+    assert "has moved" in found.told()
+
+
+def test_pair_that_stands_is_not_told(first_life):
+    loop, frame = first_life
+    assert departure(loop.engine, frame).told() is None
+    drift = Drift(loop.engine)
+    assert not drift.see(frame)
+    assert drift.see(replace(frame, right_px=frame.right_px + 1.0))
+    assert [event.kind for event in drift.suspects] == ["calibration_drift"]
+    assert not drift.see(replace(frame, stamp_ns=frame.stamp_ns + 30 * S))
+    assert drift.suspects  # a graph that is half-way in between is no better
+    assert drift.see(replace(frame, stamp_ns=frame.stamp_ns + 61 * S))
+    assert not drift.suspects
+
+
+def test_map_that_the_right_image_does_not_show_is_told_but_not_a_covered_lens(first_life):
+    loop, frame = first_life
+    known = np.isin(frame.track_ids, [*loop.engine.odometry.observations])
+    assert known.sum() > 12
+    nothing_known = replace(frame, right_px=np.where(known[:, None], np.nan, frame.right_px))
+    assert "nothing of the map" in departure(loop.engine, nothing_known).told()
+    covered = replace(frame, right_px=np.full_like(frame.right_px, np.nan))
+    assert departure(loop.engine, covered) is None

@@ -16,15 +16,18 @@ KEPT = 2000
 """Frames that the graph may be behind."""
 LOST_SPEED_M_S, LOST_TURN_RAD_S = 0.5, 1.0
 """Standard deviation of a hand-held camera's velocity about its last one, while nothing is tracked; as in the graph."""
-FIRST_TURN_RAD, FIRST_SHARE = 2e-3, 0.05
-"""Standard deviation of the motion between two keyframes before any has been compared with the graph: of the turn, and
-of each component of the way as a share of its length."""
+FIRST_TURN_RAD_M, FIRST_SHARE = 0.01, 0.05
+"""Standard deviations of a motion before any has been compared with the graph: of the turn, per metre, and of each
+component of the way, as a share of its length. Both grow with the way: cameras that are calibrated a little wrong make
+errors that do not average out."""
 WORTH = 4.0
 """Comparisons that these count as."""
 MEMORY = 0.05
 """Least share of the newest comparison in the running figures."""
-NEAR_M = 0.03
-"""A shorter way is as uncertain as this one."""
+NEAR_M, NEAR_TURNED_M = 0.03, 0.1
+"""The way and the turn of a shorter way are as uncertain as those of one so long."""
+TURNING_M = 0.5
+"""Way that makes the turn as uncertain as a radian's turning does."""
 SCALE_SIGMA = 0.1
 """How far the front end's ways may be too long or too short, as a share: it knows the cameras as they were given, and a
 depth that is always too short makes every way too short."""
@@ -41,6 +44,28 @@ class Followed:
     """Shape (6, 6), rotation first, body frame."""
     behind: int
     """Frames since the graph's keyframe."""
+
+
+@dataclass(frozen=True, slots=True)
+class Went:
+    """How far a chain has gone, there and back."""
+
+    way_m: float = 0.0
+    turned_rad: float = 0.0
+
+    def on(self, a_T_b: Float) -> "Went":
+        """After another motion (4, 4)."""
+        cosine = (float(np.trace(a_T_b[:3, :3])) - 1.0) / 2.0
+        turned = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return Went(self.way_m + float(np.linalg.norm(a_T_b[:3, 3])), self.turned_rad + turned)
+
+    def way_m2(self) -> float:
+        """By which the variance of the way grows."""
+        return self.way_m**2 + NEAR_M**2
+
+    def turning_m2(self) -> float:
+        """By which that of the turn does."""
+        return self.way_m**2 + (TURNING_M * self.turned_rad) ** 2 + NEAR_TURNED_M**2
 
 
 class Ratio:
@@ -82,16 +107,14 @@ class Follower:
         self._anchor = Place(np.eye(4), np.zeros((6, 6)))
         self._since = np.eye(4)
         """From the anchor to the newest frame."""
-        self._way_m = 0.0
-        """Length of the way since the anchor."""
+        self._went: Went | None = None
+        """Since the anchor; None at the anchor itself."""
         self._ratio = Ratio()
         self._compared = WORTH
-        self._turn_variance = np.full(3, FIRST_TURN_RAD**2)
-        """Of the turn between two keyframes, rad^2."""
+        self._turn_variance = FIRST_TURN_RAD_M**2
+        """Of each component of a turn, rad^2/m^2."""
         self._share_variance = FIRST_SHARE**2
         """Of each component of a way, as a share of its length."""
-        self._steps = 0.0
-        """Keyframe intervals since the anchor, the last one in part."""
         self._lost_s = 0.0
         self._at_ns = 0
         """Stamp of the newest frame in the chain."""
@@ -124,8 +147,7 @@ class Follower:
             return None  # one made after the fact, of a frame long gone
         self._learn(stamp_ns, place)
         self._anchor_ns, self._anchor = stamp_ns, place
-        self._since, self._steps, self._lost_s, self._at_ns = np.eye(4), 0.0, 0.0, stamp_ns
-        self._way_m = 0.0
+        self._since, self._went, self._lost_s, self._at_ns = np.eye(4), None, 0.0, stamp_ns
         newest = stamp_ns
         for stamp, frame in self._frames.items():
             if stamp > stamp_ns:
@@ -138,9 +160,7 @@ class Follower:
     def _add(self, frame: Frame) -> None:
         step = self._ratio.applied(frame.last_T_this)
         self._since = self._since @ step
-        self._way_m += float(np.linalg.norm(step[:3, 3]))
-        whole = float(np.floor(self._steps))
-        self._steps = whole + 1.0 if frame.is_keyframe else whole + 0.5
+        self._went = (self._went or Went()).on(step)
         if frame.lost:
             self._lost_s += max(frame.stamp_ns - self._at_ns, 0) * 1e-9
         self._at_ns = frame.stamp_ns
@@ -149,38 +169,37 @@ class Follower:
         """Compares the chain between the last anchor and this keyframe with the graph's motion."""
         if self._anchor_ns is None or stamp_ns <= self._anchor_ns:
             return
-        chain, steps, lost = np.eye(4), 0, False
-        for stamp, frame in self._frames.items():
-            if self._anchor_ns < stamp <= stamp_ns:
-                chain = chain @ frame.last_T_this
-                steps += frame.is_keyframe
-                lost |= frame.lost
-        if not steps or lost:
+        between = [f for stamp, f in self._frames.items() if self._anchor_ns < stamp <= stamp_ns]
+        if not between or any(f.lost for f in between):
             return
+        chain, went = np.eye(4), Went()
+        for frame in between:
+            chain, went = chain @ frame.last_T_this, went.on(frame.last_T_this)
         graph = np.linalg.inv(self._anchor.matrix) @ place.matrix
         self._ratio.learn(chain[:3, 3], graph[:3, 3], self._share_variance)
         off = gtsam.Pose3.Logmap(pose3(self._ratio.applied(chain)).between(pose3(graph)))
-        length = float(np.linalg.norm(chain[:3, 3]))
         self._compared += 1.0
         newest = max(1.0 / self._compared, MEMORY)
-        self._turn_variance += newest * (off[:3] ** 2 / steps - self._turn_variance)
-        share = float(off[3:] @ off[3:]) / 3.0 / (length**2 + NEAR_M**2)
+        turn = float(off[:3] @ off[:3]) / 3.0 / went.turning_m2()
+        share = float(off[3:] @ off[3:]) / 3.0 / went.way_m2()
+        self._turn_variance += newest * (turn - self._turn_variance)
         self._share_variance += newest * (share - self._share_variance)
 
     def _now(self, stamp_ns: int) -> Followed:
-        chain, steps, way_m = self._since, self._steps, self._way_m
+        chain, went = self._since, self._went
         if self._early is not None:  # one on from the newest of the chain
             step = self._ratio.applied(self._early.last_T_this)
-            stamp_ns, chain, steps = self._early.stamp_ns, chain @ step, float(np.floor(steps)) + 0.5
-            way_m += float(np.linalg.norm(step[:3, 3]))
+            stamp_ns, chain, went = self._early.stamp_ns, chain @ step, (went or Went()).on(step)
         since = pose3(chain)
         matrix = self._anchor.matrix @ chain
         own = self._anchor.covariance if self._anchor.covariance is not None else np.zeros((6, 6))
         back = since.inverse().AdjointMap()
         turned, moved = LOST_TURN_RAD_S * self._lost_s, LOST_SPEED_M_S * self._lost_s
         lost = np.array([turned**2] * 3 + [moved**2] * 3)
-        followed = self._share_variance * (way_m**2 + NEAR_M**2) if steps else 0.0
-        moving = np.concatenate([steps * self._turn_variance, np.full(3, followed)])
-        covariance = back @ own @ back.T + np.diag(moving + lost)
+        followed = np.zeros(6)
+        if went is not None:
+            followed[:3] = self._turn_variance * went.turning_m2()
+            followed[3:] = self._share_variance * went.way_m2()
+        covariance = back @ own @ back.T + np.diag(followed + lost)
         behind = sum(stamp > (self._anchor_ns or 0) for stamp in self._frames)
         return Followed(stamp_ns, matrix, covariance, behind)
