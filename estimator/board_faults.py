@@ -36,7 +36,6 @@ KNOCK_FALSE_ALARM = 1e-6
 SAME_PLACE = 1e-5
 """rad and m: nothing, against what any log shows."""
 ROUNDS = 6
-SETTLE_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +120,7 @@ def _column(system: LinearSystem, position: int, block: Float) -> csr_matrix:
 def _again(engine: Engine, solution: BatchSolution, update: Update, remove: list[int]) -> BatchSolution:
     """The running solver and the batch one, with some factors exchanged."""
     engine.state.values = engine.solver.update(update, remove)
-    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
+    engine.state.values = engine.solver.settle()
     return solve(engine.solver.log, solution.values, engine.rig.gates.robust_sigma)
 
 

@@ -42,6 +42,8 @@ of a batch solution; `settle` makes up for what is left at the end."""
 SETTLED = 0.1
 """Gain in half the chi-square below which an estimate has settled: the next would be a small part of it."""
 
+SETTLE_ROUNDS = 8
+"""Steps at the end, at most: it takes that many where much was learnt last."""
 MOVED_ROUNDS = 3
 """Steps after a part of the map was moved."""
 
@@ -133,24 +135,24 @@ class Incremental:
     def _drop(self, landmark: int) -> None:
         """A landmark behind the cameras that saw it has no residual, and nothing brings it back."""
         self.dropped.append(landmark)
-        self._erase(landmark)
+        self._erase({landmark})
 
     def leave_out(self, landmarks: Iterable[int]) -> gtsam.Values:
         """Takes landmarks out with all of their factors; `settle` or the next update begins anew without them."""
-        for landmark in landmarks:
-            self._erase(landmark)
+        self._erase(set(landmarks))
         self._relocated = True
         return gtsam.Values(self._values)
 
-    def _erase(self, landmark: int) -> None:
-        for index, factor, record in [row for row in self.log.active() if landmark in row[1].keys()]:
+    def _erase(self, landmarks: set[int]) -> None:
+        for index, factor, record in [row for row in self.log.active() if not landmarks.isdisjoint(row[1].keys())]:
             prior = joint_of(factor, self._values) if record.family == FAMILY else None
-            rest = None if prior is None else without(prior, {landmark})
+            rest = None if prior is None else without(prior, landmarks)
             if rest is None:
                 self.log.off.add(index)
             else:  # what is known of everything else does not go with it
                 self.log.replace(index, rest.factor())
-        self._values.erase(landmark)
+        for landmark in landmarks:
+            self._values.erase(landmark)
 
     def _rebuild(self) -> None:
         """Starts iSAM2 anew from a damped batch optimum.
@@ -284,7 +286,7 @@ class Incremental:
         self._values, self._relocated = values, True
         return gtsam.Values(values)
 
-    def settle(self, rounds: int) -> gtsam.Values:
+    def settle(self, rounds: int = SETTLE_ROUNDS) -> gtsam.Values:
         """iSAM2 anew at its own latest estimate until that stays where it is, at most `rounds` times.
 
         While it runs it relinearises what has moved far enough, now and then; what many small moves make together,

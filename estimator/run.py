@@ -3,10 +3,13 @@
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 
+import gtsam
+
 from ..factors.camera import CameraModel
 from ..factors.errors import ObservabilityError
 from ..factors.measurements import Event, Rejection
 from ..factors.rig import Rig, sha256_of
+from .aside import Aside
 from .batch import BatchSolution, solve
 from .board_faults import settle_boards
 from .bundle import bundles
@@ -16,11 +19,12 @@ from .result import Result
 from .summary import Summary
 from .surfaces import Associator
 
-SETTLE_ROUNDS = 8
 
-
-def solved(engine: Engine) -> BatchSolution:
+def solved(engine: Engine, apart: bool = False) -> BatchSolution:
     """Settles iSAM2, and refines in batch over the same factors.
+
+    Args:
+        apart: both at the same time, the former in a copy of the process.
 
     Raises:
         ObservabilityError: nothing ties the log together.
@@ -33,9 +37,31 @@ def solved(engine: Engine) -> BatchSolution:
             "the rig file (`surecut info LOG`)"
         )
     leave_out_pipe_tracks(engine)
-    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
-    solution = solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    solution = _both_ways(engine) if apart else _refined(engine)
     return settle_boards(engine, solution)
+
+
+def _refined(engine: Engine) -> BatchSolution:
+    engine.state.values = engine.solver.settle()
+    return solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+
+
+def _both_ways(engine: Engine) -> BatchSolution:
+    """The batch solution needs no settled start; it only takes a few steps more."""
+    solver = engine.solver
+    running: Aside[tuple[gtsam.Values, int]] = Aside(apart=True, niceness=0)
+    running.begin(lambda: (solver.settle(), len(solver.dropped)))
+    try:
+        solution = solve(solver.log, solver.values(), engine.rig.gates.robust_sigma)
+        values, dropped = running.awaited()
+    except ObservabilityError:
+        return _refined(engine)  # which may give up landmarks that nothing determines, or tells what is missing
+    finally:
+        running.stop()
+    if dropped != len(solver.dropped):
+        return _refined(engine)
+    engine.state.values = solver.relocate(values, (), gtsam.Pose3())
+    return solution
 
 
 def finish(
@@ -57,7 +83,7 @@ def finish(
     Raises:
         ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
     """
-    solution = solved(engine)
+    solution = solved(engine, apart)
     engine.boards.inspection.doubled_in_images(rejected)
     engine.rejected += rejected
     engine.events += events

@@ -116,21 +116,34 @@ class TrackGate:
         K = self._state.intrinsics(keys.intrinsics("m_left")).K()
         chosen = rows[:: max(len(rows) // DRIFT_SAMPLE, 1)]
         residual = self._residuals(frame, chosen, pose)[0] - shift
+        landmarks = [keys.landmark(int(frame.track_ids[r])) for r in chosen]
         found = []
-        for r, off in zip(chosen, residual, strict=True):
-            landmark = keys.landmark(int(frame.track_ids[r]))
+        for r, off, landmark, joint in zip(chosen, residual, landmarks, self._joints(last, landmarks), strict=True):
+            if joint is None:  # a landmark that nothing determines explains nothing
+                found.append(float("inf"))
+                continue
             x, y, z = c_p = pose.transformTo(self._state.point(landmark))
             by_point = K[:2, :2] @ np.array([[1 / z, 0, -x / z**2], [0, 1 / z, -y / z**2]])
             by_pose = np.hstack([by_point @ gtsam.Rot3.Hat(c_p), -by_point]) @ to_last
             J = np.hstack([by_pose, by_point @ pose.rotation().matrix().T])
-            try:
-                joint = self.joint_covariance([last, landmark])
-            except ObservabilityError:  # a landmark that nothing determines explains nothing
-                found.append(float("inf"))
-                continue
             covariance = J @ joint @ J.T + frame.left_covariance_px2[r]
             found.append(float(np.sqrt(off @ np.linalg.solve(covariance, off))))
         return float(np.median(found))
+
+    def _joints(self, pose: int, landmarks: list[int]) -> list[Float | None]:
+        """Joint covariance (9, 9) of a pose with each landmark; None of those that nothing determines.
+
+        All of them take one elimination of the graph, each alone takes one.
+        """
+        assert self.joint_covariance is not None
+        try:
+            joint = self.joint_covariance([pose, *landmarks])
+        except ObservabilityError:
+            if len(landmarks) == 1:
+                return [None]
+            return [self._joints(pose, [landmark])[0] for landmark in landmarks]
+        own = [[*range(6), *range(6 + 3 * i, 9 + 3 * i)] for i in range(len(landmarks))]
+        return [joint[np.ix_(part, part)] for part in own]
 
 
 def residuals(

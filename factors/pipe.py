@@ -91,27 +91,39 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
+    def ends(values: gtsam.Values) -> tuple[Float, Float]:
+        return values.atPoint3(variables[2]), values.atPoint3(variables[3])
+
+    def visible(values: gtsam.Values) -> float:
+        return float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
+
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
         c_T_s = values.atPose3(variables[6]) if len(variables) == 7 else None
         K = values.atCal3DS2(variables[1]).K()
-        seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
-        visible = float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
-        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible)
-        if jacobians is not None:
-            d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
-            jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
-            # Edges were fitted in ideal pixels; what the lens model leaves over is far below their sigma.
-            jacobians[1] = np.hstack([d_K, np.zeros((2, 4))])
-            jacobians[2] = d_a @ seen[0][2]
-            jacobians[3] = d_b @ seen[1][2]
-            jacobians[4] = d_shape[:, 6:]
-            jacobians[5] = -d_shape[:, 6:]
-            if c_T_s is not None:
-                jacobians[6] = d_a @ seen[0][3] + d_b @ seen[1][3]
+        if jacobians is None:
+            return _distances(line @ K, o_T_c, c_T_s, ends(values)) - visible(values)
+        seen = [_seen(o_T_c, c_T_s, end) for end in ends(values)]
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible(values))
+        d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
+        jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
+        # Edges were fitted in ideal pixels; what the lens model leaves over is far below their sigma.
+        jacobians[1] = np.hstack([d_K, np.zeros((2, 4))])
+        jacobians[2] = d_a @ seen[0][2]
+        jacobians[3] = d_b @ seen[1][2]
+        jacobians[4] = d_shape[:, 6:]
+        jacobians[5] = -d_shape[:, 6:]
+        if c_T_s is not None:
+            jacobians[6] = d_a @ seen[0][3] + d_b @ seen[1][3]
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
+
+
+def _distances(plane: Float, o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, points: tuple[Float, Float]) -> Float:
+    """Of points of {o} from a plane through the sensor's centre, with any normal in its frame; shape (2,)."""
+    o_T_s = o_T_c if c_T_s is None else o_T_c.compose(c_T_s)
+    return np.array([plane @ o_T_s.transformTo(p) for p in points]) / np.sqrt(plane @ plane)
 
 
 def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:

@@ -18,7 +18,6 @@ from ..estimator.linear import LinearSystem
 from ..estimator.points_in_base import point_blocks
 from ..estimator.result import Result
 from ..estimator.result_json import from_json, to_json
-from ..estimator.run import SETTLE_ROUNDS
 from ..estimator.surfaces import lay_on_surfaces
 from ..estimator.validated_range import ValidatedRange
 from ..factors import keys
@@ -91,7 +90,7 @@ def ideal_covariances(scenario: Scenario, number: int) -> dict[str, Float]:
     for bundle in bundles(list(run.measurements)):
         engine.add(bundle)
     engine.revisit()
-    values = engine.solver.settle(SETTLE_ROUNDS)
+    values = engine.solver.settle()
     system = LinearSystem(engine.solver.log.graph(), values)
     points = [point for point in engine.pipes.points.values() if point.known and values.exists(keys.base(0))]
     return {

@@ -14,7 +14,7 @@ from surecut.estimator.advice_scene import Surroundings
 from surecut.estimator.batch import solve
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
-from surecut.estimator.run import SETTLE_ROUNDS, estimate
+from surecut.estimator.run import estimate
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors.measurements import Pick
 from surecut.simulation.measurement_level import _build_world, draw
@@ -97,7 +97,7 @@ def advised_place(run, text):
     engine = Engine(run.rig, run.cameras, lay_on_surfaces)
     for bundle in bundles(list(run.measurements)):
         engine.add(bundle)
-    engine.state.values = engine.solver.settle(SETTLE_ROUNDS)
+    engine.state.values = engine.solver.settle()
     solution = solve(engine.solver.log, engine.state.values, run.rig.gates.robust_sigma)
     active = [row for row in engine.solver.log.active() if row[0] not in solution.outliers]
     scene = Surroundings(engine, solution.values, active)

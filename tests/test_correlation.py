@@ -28,7 +28,8 @@ class Factor:
 
 
 def run(draw, tracks=400, seed=3, longest=20):
-    """Tracks of 4 to `longest` views with drawn errors (views, camera, axis), each with its point (u, v, disparity)."""
+    """Tracks of 4 to `longest` views with drawn errors (views, camera, axis), each with its fitted point (u, v,
+    disparity)."""
     rng = np.random.default_rng(seed)
     active, errors, i, j, data = [], [], [], [], []
     for track in range(tracks):

@@ -140,12 +140,18 @@ def average_depth(depths_m: Float32, share: float = 0.5) -> Float32:
     Pixels valid in less than `share` of the frames stay invalid; so do those that jump between two surfaces from
     frame to frame (range over 10 % of the depth).
     """
-    valid = np.isfinite(depths_m)
-    count = valid.sum(axis=0)
-    total = np.where(valid, depths_m, 0).sum(axis=0)
-    low = np.where(valid, depths_m, np.inf).min(axis=0)
-    high = np.where(valid, depths_m, -np.inf).max(axis=0)
+    shape = depths_m.shape[1:]
+    count, total = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
+    low, high = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
     with np.errstate(invalid="ignore", divide="ignore"):
+        for image in depths_m:  # one by one: together they are larger than a processor's cache
+            depth = np.asarray(
+                image + (image - image), np.float32
+            )  # infinite becomes NaN, which fmin and fmax pass over
+            count += np.isfinite(depth)
+            np.fmin(low, depth, out=low)
+            np.fmax(high, depth, out=high)
+            total += cv2.patchNaNs(depth, 0.0)
         mean = total / count
         keep = (count >= share * len(depths_m)) & (high - low < 0.1 * mean)
     return np.where(keep, mean, np.nan).astype(np.float32)

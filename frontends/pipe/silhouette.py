@@ -124,9 +124,9 @@ class OutlineFinder:
         return self._decide(stamp_ns, pipe_id, found, prior)
 
     def _window(self, centre: Float) -> tuple[slice, slice]:
-        distance = np.abs(self._ideal - centre).max(axis=2)
         reach = self._config.reach_px
-        near = distance < reach
+        near = np.abs(self._ideal[..., 0] - centre[0]) < reach
+        near &= np.abs(self._ideal[..., 1] - centre[1]) < reach
         rows, columns = np.nonzero(near.any(axis=1))[0], np.nonzero(near.any(axis=0))[0]
         if len(rows) == 0:
             return slice(0, 0), slice(0, 0)
