@@ -48,8 +48,10 @@ def page_factor(
 ) -> gtsam.CustomFactor:
     """Four corners of a marker lie on the page: `f_q = scale * centre + side / 2 * direction`.
 
-    Residual (12,) in the page frame. The marker's own place on the page (`centre_sigma_m`) is common to its four
-    corners: eliminating it as a Gaussian gives the covariance sigma_c^2 11^T + sigma_print^2 I.
+    Residual (12,) in the page frame and in units of the page's scale: with tolerances in metres a page that shrinks
+    (and is nearer, so that it looks the same) would seem to fit better. The marker's own place on the page
+    (`centre_sigma_m`) is common to its four corners: eliminating it as a Gaussian gives the covariance
+    sigma_c^2 11^T + sigma_print^2 I.
 
     Args:
         detection_m: the part of a corner's detection error that stays the same in all views, on the page.
@@ -74,15 +76,16 @@ def page_factor(
         for i in range(4):
             f_q, d_pose, d_point = point_to_frame(o_T_f, values.atPoint3(variables[2 + i]))
             rows = slice(3 * i, 3 * i + 3)
-            residual[rows] = f_q - scale * centre - side * half[i]
-            pose_jacobian[rows] = d_pose
+            residual[rows] = (f_q - scale * centre - side * half[i]) / scale
+            pose_jacobian[rows] = d_pose / scale
             if jacobians is not None:
                 block = np.zeros((12, 3))
-                block[rows] = d_point
+                block[rows] = d_point / scale
                 jacobians[2 + i] = block
         if jacobians is not None:
             jacobians[0] = pose_jacobian
-            jacobians[1] = page_jacobian
+            jacobians[1] = page_jacobian / scale
+            jacobians[1][:, 1] -= residual / scale
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
