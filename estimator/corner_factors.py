@@ -16,7 +16,7 @@ from .board_news import GEOMETRY, BoardNews
 from .board_start import inset_sigma_px
 from .graph import Record, State, Update
 from .sheet import PageFactor, Sheet
-from .view_cells import LEAST_OWN_SHARE, ViewCells, added_covariance
+from .view_cells import ViewCells, added_covariance
 
 Float = NDArray[np.float64]
 
@@ -24,8 +24,10 @@ LASTING = 0.5
 """Share of the common part of a corner's error that stays on the page in all views, whatever their place; the rest is
 another one at each place. Nothing tells: print and paper last, what the sampling by pixels does to an edge does not."""
 LASTING_PX = 0.014
-"""Least sigma of what stays on the page, where a corner's own sigma holds so much: 0.009 to 0.034 px over eight
+"""Least sigma of what stays on the page, where half of a corner's variance holds so much: 0.009 to 0.034 px over eight
 rendered recordings, by the mean over a corner's views against the truth (docs/corners.md)."""
+MOST_LASTING = 0.5
+"""Of a corner's variance: views differ by the rest at least."""
 STILL_VIEWS = 40
 """Views of a board from one place after which further ones are left out: they would count one part in so many."""
 
@@ -126,7 +128,7 @@ class CornerFactors:
 def _lasting_px(sighting: MarkerSighting, least_px: float) -> float:
     """Sigma of what stays on the page of a corner's error."""
     common = max(least_px, independent_common_px(sighting))
-    most = (1.0 - LEAST_OWN_SHARE) * _mean_variance(corner_covariance(sighting, least_px))
+    most = MOST_LASTING * _mean_variance(corner_covariance(sighting, least_px))
     return float(np.sqrt(min(max(LASTING * common**2, LASTING_PX**2), most)))
 
 

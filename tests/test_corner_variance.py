@@ -65,7 +65,7 @@ def test_what_many_images_say_of_the_common_part_is_the_least_for_each():
     [
         (0.0, 0.05, corner_factors.LASTING_PX),
         (0.04, 0.05, 0.04 / np.sqrt(2)),
-        (0.0, 0.01, 0.01 * np.sqrt(0.9)),  # no more than the corner's own sigma holds
+        (0.0, 0.01, 0.01 * np.sqrt(0.5)),  # no more than the corner's own sigma holds
     ],
 )
 def test_a_part_of_the_error_stays_on_the_page(common_px, sigma_px, lasting_px):
