@@ -96,7 +96,6 @@ class Adrift:
         self._fresh = False
         if not broken and not self.strands:
             return None
-        self._graph.flush()
         self._expected = self._odometry.expected()
         placed = None
         if broken or self._open is not None:
@@ -114,7 +113,8 @@ class Adrift:
         if broken:
             self._put_aside()
         elif self._open is not None:
-            self._carry(self._open, found.compose(self._expected.inverse()))
+            self._graph.flush()
+            self._carry(self._open, found.compose(self._odometry.expected().inverse()))
             self._open = None
         self._reach_m = 0.0
         self.found += 1
@@ -131,6 +131,7 @@ class Adrift:
                 self._put_aside()
                 self._open = strand
                 return found
+            self._graph.flush()
             expected = self._odometry.expected()
             if self._open is None:
                 self._carry(strand, expected.compose(found.inverse()))
@@ -194,7 +195,6 @@ class Adrift:
 
     def _carry(self, strand: Strand, correction: gtsam.Pose3) -> None:
         """All of a strand, moved in {o}; the solver begins anew from there, with what is seen now."""
-        self._graph.flush()
         self._graph.relocate(strand.moved(self._graph.solver.values(), correction), strand.own, correction)
 
     # What a frame shows ---------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import pickle
 import select
 import signal
 import traceback
+import warnings
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
@@ -50,7 +51,9 @@ class Aside(Generic[Made]):
             return
         self._end, theirs = os.pipe()
         self._said = b""
-        self._pid = os.fork()
+        with warnings.catch_warnings():  # of other threads: the copy waits for nothing that they hold
+            warnings.filterwarnings("ignore", ".*fork.*", DeprecationWarning)
+            self._pid = os.fork()
         if self._pid == 0:
             _copy(work, theirs, self._niceness)
         os.close(theirs)

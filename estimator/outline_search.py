@@ -1,9 +1,10 @@
 """The outlines of named pipes in pictures of keyframes: about a click at once, elsewhere once a pipe is known."""
 
-from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict, deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,6 +40,16 @@ class _View:
     prior: OutlinePrior
 
 
+@dataclass(slots=True)
+class _Apart:
+    """Views of one pipe by one camera that differ."""
+
+    places: dict[int, Float] = field(default_factory=dict)
+    """Where the camera stood, by stamp."""
+    passed: set[int] = field(default_factory=set)
+    """Stamps of views that are too near to one of these, or of no use."""
+
+
 class OutlineSearch:
     """Keeps pictures, and looks for pipes in them where the engine's estimate says that they are."""
 
@@ -60,14 +71,10 @@ class OutlineSearch:
         self._widths = PipeWidths(engine)
         self._kept: deque[PairImages] = deque()
         self._kept_bytes = 0
-        self._looked: dict[str, dict[int, Float]] = {}
-        """Where the camera stood in views whose outline was looked for, by pipe and camera, and stamp."""
-        self._passed: dict[str, set[int]] = {}
-        """Stamps of views too near to one of these."""
-        self._apart: dict[str, dict[int, Float]] = {}
-        """Where the camera stood in views that differ, of all that show the pipe, by pipe and camera, and stamp."""
-        self._alike: dict[str, set[int]] = {}
-        """Stamps of views too near to one of these, or without the pipe."""
+        self._looked: defaultdict[tuple[str, str], _Apart] = defaultdict(_Apart)
+        """Views whose outline was looked for, by pipe and camera."""
+        self._shown: defaultdict[tuple[str, str], _Apart] = defaultdict(_Apart)
+        """Views that show the pipe, likewise."""
 
     def see(self, pair: PairImages, picks: Sequence[Pick]) -> None:
         """A keyframe's pictures, and the clicks in them."""
@@ -127,34 +134,40 @@ class OutlineSearch:
 
     def _measure_width(self, pipe: str, ends: tuple[Float, Float], anew: bool) -> None:
         if anew:
-            self._alike.clear()
+            for shown in self._shown.values():
+                shown.passed.clear()
         views = [KeptView(pair, camera) for camera in MOBILE for pair in self._differing(pipe, camera, ends)]
         if self._widths.measure(pipe, ends, views, anew):
             # What was found without knowing the width is looked for again.
             stamps = {pair.stamp_ns for pair in self._kept}
             self._widths.forget_outlines(pipe, stamps)
             for camera in MOBILE:
-                looked = self._looked.get(f"{pipe} {camera}", {})
-                self._looked[f"{pipe} {camera}"] = {s: place for s, place in looked.items() if s not in stamps}
-                self._passed.pop(f"{pipe} {camera}", None)
+                looked = self._looked[pipe, camera]
+                looked.places = {s: place for s, place in looked.places.items() if s not in stamps}
+                looked.passed.clear()
 
     def _differing(self, pipe: str, camera: str, ends: tuple[Float, Float]) -> list[PairImages]:
         """Kept pictures that show a part of a pipe, each from somewhere else."""
-        apart = self._apart.setdefault(f"{pipe} {camera}", {})
-        alike = self._alike.setdefault(f"{pipe} {camera}", set())
-        model = self._engine.cameras[camera]
-        for pair in [kept for kept in self._kept if kept.stamp_ns not in apart and kept.stamp_ns not in alike]:
-            if len(apart) >= OUTLINE_VIEWS:
-                break
+        shown, model = self._shown[pipe, camera], self._engine.cameras[camera]
+        for pair, o_T_c in self._elsewhere(shown, camera):
+            if part_in_sight(model, *(o_T_c.transformTo(end) for end in ends)):
+                shown.places[pair.stamp_ns] = o_T_c.translation()
+            else:
+                shown.passed.add(pair.stamp_ns)
+        return [pair for pair in self._kept if pair.stamp_ns in shown.places]
+
+    def _elsewhere(self, views: _Apart, camera: str) -> Iterator[tuple[PairImages, gtsam.Pose3]]:
+        """Kept pictures from somewhere else than the views that are there, and `o_T_c`; whoever takes one enters it."""
+        for pair in [p for p in self._kept if p.stamp_ns not in views.places and p.stamp_ns not in views.passed]:
+            if len(views.places) >= OUTLINE_VIEWS:
+                return
             where = self._engine.seen_from(camera, pair.stamp_ns)
             if where is None:
                 continue
-            place = where.o_T_c.translation()
-            if not _near(place, apart) and part_in_sight(model, *(where.o_T_c.transformTo(end) for end in ends)):
-                apart[pair.stamp_ns] = place
+            if _near(where.o_T_c.translation(), views.places):
+                views.passed.add(pair.stamp_ns)
             else:
-                alike.add(pair.stamp_ns)
-        return [pair for pair in self._kept if pair.stamp_ns in apart]
+                yield pair, where.o_T_c
 
     def _about(self, pick: Pick, pair: PairImages) -> None:
         """The outline about a click."""
@@ -164,8 +177,7 @@ class OutlineSearch:
         self._take(self._finder(pick.camera).find(pair.stamp_ns, pipe, pair.of(pick.camera), prior))
         where = self._engine.seen_from(pick.camera, pair.stamp_ns)
         if where is not None:
-            looked = self._looked.setdefault(f"{pipe} {pick.camera}", {})
-            looked[pair.stamp_ns] = where.o_T_c.translation()
+            self._looked[pipe, pick.camera].places[pair.stamp_ns] = where.o_T_c.translation()
 
     def _choose(self, pipe: str, camera: str) -> None:
         """Views for a known pipe's outline that differ from those already used."""
@@ -173,24 +185,13 @@ class OutlineSearch:
         if expected is None:
             return
         ends, radius, radius_sigma = expected
-        looked = self._looked.setdefault(f"{pipe} {camera}", {})
-        passed = self._passed.setdefault(f"{pipe} {camera}", set())
-        model = self._engine.cameras[camera]
-        for pair in [kept for kept in self._kept if kept.stamp_ns not in looked and kept.stamp_ns not in passed]:
-            if len(looked) >= OUTLINE_VIEWS:
-                break
-            where = self._engine.seen_from(camera, pair.stamp_ns)
-            if where is None:
-                continue
-            place = where.o_T_c.translation()
-            if _near(place, looked):
-                passed.add(pair.stamp_ns)
-                continue
-            a, b = (where.o_T_c.transformTo(end) for end in ends)
+        looked, model = self._looked[pipe, camera], self._engine.cameras[camera]
+        for pair, o_T_c in self._elsewhere(looked, camera):
+            a, b = (o_T_c.transformTo(end) for end in ends)
             sigma = radius_sigma or unmeasured_sigma(radius, 0.5 * float(a[2] + b[2]), model.fx)
             prior = predict_outline(model, a, b, radius, AXIS_SIGMA_M, DIRECTION_SIGMA_RAD, sigma)
             if prior is not None:
-                looked[pair.stamp_ns] = place
+                looked.places[pair.stamp_ns] = o_T_c.translation()
                 self._ahead.append(_View(pipe, camera, pair, prior))
 
     def _expected(self, pipe: str) -> tuple[tuple[Float, Float], float, float] | None:

@@ -53,6 +53,7 @@ LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder",
 class _Rest:
     """Parts of a result that need no other but the points."""
 
+    trajectory: tuple[PoseEstimate, ...]
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
     motions: tuple[MotionEstimate, ...]
@@ -97,7 +98,6 @@ class Summary:
             distances = self._distances(between)
             self._tell_corner_rms()
             poses = self._poses()
-            path = trajectory(engine.odometry, self._values, self._keyframe_covariances())
             calibration = calibration_rows(engine, self._values, self._sigmas)
             other = rest.awaited()
         finally:
@@ -105,7 +105,7 @@ class Summary:
         return Result(
             points=points,
             poses=poses,
-            trajectory=path,
+            trajectory=other.trajectory,
             pipes=pipes,
             calibration=calibration,
             distances=distances,
@@ -129,6 +129,7 @@ class Summary:
     def _rest(self, points: tuple[PointEstimate, ...], memory: Callable[[], str]) -> "_Rest":
         """What changes nothing and is told to nobody before the end."""
         return _Rest(
+            trajectory(self._engine.odometry, self._values, self._keyframe_covariances()),
             self._advice(points),
             pick_views(self._engine, self._values, self._system),
             motions(self._values, self._system, self._engine.odometry.keyframe_stamps),

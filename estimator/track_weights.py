@@ -112,7 +112,7 @@ def _views(active: Active, family: str) -> Views:
     views: dict[int, list[int]] = {}
     for position, (_, factor, record) in enumerate(active):
         if record.family == family and record.camera in CAMERAS:
-            views.setdefault(next(k for k in factor.keys() if keys.kind(k) == "l"), []).append(position)
+            views.setdefault(keys.landmark_among(factor.keys()), []).append(position)
     return [(landmark, np.array(positions)) for landmark, positions in views.items()]
 
 

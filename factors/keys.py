@@ -1,5 +1,7 @@
 """The only place where variables get their symbols, and their names in words."""
 
+from collections.abc import Iterable
+
 import gtsam
 
 _WORDS = {
@@ -103,9 +105,24 @@ DEPTH_RAYS: int = gtsam.symbol("g", 0)
 """Rays of the depth camera, z = 1: true = given * (1 + scale) + shift; Vector3 (shift x, shift y [rad], scale)."""
 
 
+_LANDMARK = ord("l")
+
+
 def kind(key: int) -> str:
     """The letter of a key: its highest byte. Asked for all factors' keys, for which GTSAM's own Symbol is slow."""
     return chr(key >> 56)
+
+
+def landmark_among(several: Iterable[int]) -> int:
+    """The first landmark's key. Asked for all factors that see one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for key in several:
+        if key >> 56 == _LANDMARK:
+            return key
+    raise ValueError("no landmark among the keys")
 
 
 def index(key: int) -> int:

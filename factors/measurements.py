@@ -44,7 +44,7 @@ class MarkerSighting:
     @property
     def good(self) -> Int:
         """The corners that are used, in order."""
-        return np.setdiff1d(np.arange(4), np.array(self.gross, dtype=np.int64))
+        return np.array([corner for corner in range(4) if corner not in self.gross], dtype=np.int64)
 
     @property
     def diagonal_px(self) -> float:

@@ -94,7 +94,7 @@ def dark(engine, stamp_ns):
     return stamp_ns
 
 
-def run(by_board=False, picks_at=(), strange_again=False, limits=None):
+def run(by_board=False, picks_at=(), strange_again=False, limits=None, end=None):
     """Before, strange and again have track names of their own: the front end knows nothing again until the return."""
     rng = np.random.default_rng(4)
     spots = rng.uniform(-1, 1, (6000, 3))
@@ -102,7 +102,7 @@ def run(by_board=False, picks_at=(), strange_again=False, limits=None):
     engine = Engine(rig(), {"m_left": camera("m_left"), "m_right": camera("m_right", BASELINE)}, lay_on_surfaces)
     bounded = Bounded(engine, limits) if limits else None
     stamp_ns, last, adrift = 0, np.eye(4), []
-    for step in range(ROUND if strange_again else END):
+    for step in range(end or (ROUND if strange_again else END)):
         pose = true_pose(step)
         lost = step in (STRANGE, AGAIN)
         if lost:
@@ -181,6 +181,22 @@ def test_a_strange_view_that_is_seen_again_finds_its_place():
     assert all(errors(result, step)[0] < 0.01 for step in range(ROUND))
     assert all(errors(result, step)[2] < 4.0 for step in range(ROUND))
     assert "sight_lost" not in kinds(result)
+
+
+def test_a_way_that_is_never_found_says_so_and_harms_nothing():
+    engine, adrift = run(by_board=True, picks_at=[("nowhere", STRANGE + 1), ("nowhere", STRANGE + 2)], end=BACK - 1)
+    assert adrift[-1]
+    result = finish(engine)
+    assert all(errors(result, step)[0] < 0.003 for step in range(STRANGE))
+    for step in range(STRANGE, BACK - 1):
+        off_m, _, nees = errors(result, step)
+        assert off_m > 0.1
+        assert nees < 4.0
+    assert kinds(result).count("sight_lost") == 2
+    assert "board_knocked" not in kinds(result)
+    assert [r.what for r in result.rejected if r.reason.startswith("the camera's place")] == [
+        "pick nowhere in m_left"
+    ] * 2
 
 
 def test_clicks_in_a_strange_view_wait_for_its_place():

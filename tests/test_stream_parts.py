@@ -242,7 +242,6 @@ def test_points_creep_together():
 
 
 @pytest.mark.parametrize("apart", [False, True])
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_work_aside_comes_back_or_says_why(apart):
     aside, state = Aside(apart), [1]
 
