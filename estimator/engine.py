@@ -36,7 +36,7 @@ from .open_graph import OpenGraph
 from .open_views import UNPLACED, OpenViews
 from .pipe_parts import SeenFrom
 from .pipes import Pipes
-from .placement import place, place_by_landmarks
+from .placement import place, place_again
 from .surfaces import Associator, Surfaces, SurfaceSettings
 
 MARKER_KEYFRAMES = 10
@@ -146,7 +146,11 @@ class Engine:
     def _insert_keyframe(self, bundle: Bundle) -> None:
         if bundle.frame is not None:
             found = self.adrift.found
-            placed = self._relocalised(bundle) if self.astray else self.adrift.meet(bundle.frame, _mobile(bundle))
+            frame, mobile = bundle.frame, _mobile(bundle)
+            if self.astray:
+                placed = place_again(self.boards, self.state, mobile, frame, self.odometry.observations)
+            else:
+                placed = self.adrift.meet(frame, mobile)
             if self.astray and placed is None:
                 return
             self.astray = False
@@ -174,16 +178,6 @@ class Engine:
                 self._retry_picks()
             if not self.adrift:
                 self.machine.lay_landmarks(index)
-
-    def _relocalised(self, bundle: Bundle) -> gtsam.Pose3 | None:
-        """Where the camera stands in the map of an earlier run, by the boards that it sees, or by landmarks of then
-        that the front end has found again."""
-        found = None
-        if _mobile(bundle):
-            found = place(self.boards, self.state, bundle.sightings, (gtsam.Pose3(), 1 << 62))
-        if found is None and bundle.frame is not None:
-            found = place_by_landmarks(self.state, bundle.frame, self.odometry.observations)
-        return found
 
     def promote(self, bundle: Bundle) -> bool:
         """Makes a frame of the recent past a keyframe, because somebody clicked in it; False where that is too late."""

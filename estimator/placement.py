@@ -50,6 +50,19 @@ def place(
     return min([best, *rivals], key=lambda pose: float(np.linalg.norm(gtsam.Pose3.Logmap(near[0].between(pose)))))
 
 
+def place_again(
+    boards: Boards, state: State, mobile: Sequence[MarkerSighting], frame: StereoFrame, wanted: Container[int]
+) -> gtsam.Pose3 | None:
+    """`o_T_m` in the map of an earlier run, by the boards that are seen, or by landmarks that have been found again.
+
+    Args:
+        mobile: sightings in the mobile cameras.
+        wanted: tracks that are landmarks of that map.
+    """
+    found = place(boards, state, mobile, (gtsam.Pose3(), 1 << 62)) if mobile else None
+    return found or place_by_landmarks(state, frame, wanted)
+
+
 def place_by_landmarks(state: State, frame: StereoFrame, wanted: Container[int]) -> gtsam.Pose3 | None:
     """`o_T_m` from where a frame shows landmarks again; None where these are too few, or do not agree.
 

@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from ...factors.camera import CameraModel
 from ...factors.measurements import StereoFrame
-from ..undistort import distort, undistort
+from ..undistort import undistort
 from . import points
 from .atlas import Atlas, Memorable, settled_tracks
 from .detection import apart, detect
+from .expectation import expected_flow
 from .finding import FADING, Finding, Found
 from .flow import checked_flow, inside
-from .geometry import Float, StereoGeometry, exponential, inverse, logarithm, median, project, transform
+from .geometry import Float, StereoGeometry, exponential, inverse, least_spread, logarithm, median, transform
 from .keyframes import keyframe_reason
 from .landmarks import LandmarkStore
 from .motion import Motion, estimate_motion
@@ -23,7 +24,7 @@ from .pair import StereoPair, prepare
 from .places import PlaceStore, Relocalisation
 from .revisit import revisit
 from .settings import StereoSettings
-from .sighting import Sighting, blind_frame, nothing_seen
+from .sighting import Sighting, blind_frame, keyframe_of, nothing_seen, plain_frame
 from .tracks import Int, Tracks, no_tracks
 from .vertical import VerticalCorrection
 
@@ -170,7 +171,7 @@ class StereoFrontEnd:
     def _track(self, last: StereoPair, pair: StereoPair, guess: Float) -> None:
         """Flow from the last left image into this one; what does not come back ends."""
         tracks, settings = self._tracks, self.settings
-        expected = self._flow_guess(guess)
+        expected = expected_flow(tracks, self.rig.left, self._keyframe_T_last, guess)
         found, good = checked_flow(
             last.left_as_bright_as(pair),
             pair.left,
@@ -191,17 +192,6 @@ class StereoFrontEnd:
         if mask.any():
             self.landmarks.add(self._tracks.take(mask), self._chain_T_keyframe)
             self._tracks.keep(~mask)
-
-    def _flow_guess(self, guess: Float) -> Float:
-        """Expected raw pixels: points move with the camera, the rest as the median of them."""
-        tracks, camera = self._tracks, self.rig.left
-        before = distort(camera, project(transform(inverse(self._keyframe_T_last), tracks.points), camera))
-        after = distort(camera, project(transform(inverse(guess), tracks.points), camera))
-        shift = after - before
-        known = np.isfinite(shift).all(axis=1)
-        if not known.all():
-            shift[~known] = np.median(shift[known], axis=0) if known.any() else 0.0
-        return tracks.raw_px + np.clip(shift, -0.3 * self._diagonal, 0.3 * self._diagonal)
 
     def _motion_of_flow(self, left_px: Float, guess: Float) -> Motion | None:
         """Motion since the last keyframe from left pixels as the flow leaves them."""
@@ -225,7 +215,7 @@ class StereoFrontEnd:
             self.rig,
             self.settings.min_inliers,
         )
-        if motion is None or not self._well_spread(px[usable][motion.inliers, :2]):
+        if motion is None or least_spread(px[usable][motion.inliers, :2]) < self.settings.min_spread * self._diagonal:
             return None
         strikes = np.zeros(len(tracks), dtype=np.int64)
         strikes[usable] = np.where(motion.inliers, 0, 1 + (motion.chi2 > 60.0))
@@ -235,13 +225,6 @@ class StereoFrontEnd:
         chi2 = np.full(len(tracks), np.nan)
         chi2[usable] = motion.chi2
         return Motion(motion.reference_T_this, inliers, chi2)
-
-    def _well_spread(self, px: Float) -> bool:
-        """Inliers in one corner or on one line hold the pose badly."""
-        u, v = (px - px.mean(axis=0)).T
-        uu, uv, vv = (float(product) / (len(px) - 1) for product in (u @ u, u @ v, v @ v))
-        least = 0.5 * (uu + vv) - float(np.hypot(0.5 * (uu - vv), uv))
-        return least > (self.settings.min_spread * self._diagonal) ** 2
 
     def _wants_keyframe(self, left_px: Float, pose: Float) -> str | None:
         flow = left_px - self._tracks.keyframe_px
@@ -258,19 +241,9 @@ class StereoFrontEnd:
         return last_T_this
 
     def _plain_frame(self, pair: StereoPair, left_px: Float, motion: Motion) -> StereoFrame:
-        tracks = self._tracks
-        n = len(tracks)
-        frame = StereoFrame(
-            stamp_ns=pair.stamp_ns,
-            is_keyframe=False,
-            track_ids=tracks.ids.copy(),
-            left_px=left_px,
-            left_covariance_px2=np.tile(self._noise.flow_variance * np.eye(2), (n, 1, 1)),
-            right_px=np.full((n, 2), np.nan),
-            right_covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
-            last_T_this=self._advance(pair, motion.reference_T_this),
-            motion_inliers=int(motion.inliers.sum()),
-        )
+        tracks, inliers = self._tracks, int(motion.inliers.sum())
+        last_T_this = self._advance(pair, motion.reference_T_this)
+        frame = plain_frame(pair.stamp_ns, tracks.ids, left_px, self._noise.flow_variance, last_T_this, inliers)
         tracks.keep((tracks.strikes < 3) & np.isfinite(left_px).all(axis=1))
         return frame
 
@@ -379,18 +352,7 @@ class StereoFrontEnd:
         self._keyframe_count = len(tracks)
         variance = sighting.left_covariance[:, 1, 1] + sighting.right_covariance[:, 1, 1]
         self._vertical.learn(sighting.left_px, sighting.right_px, variance)
-        frame = StereoFrame(
-            stamp_ns=view.pair.stamp_ns,
-            is_keyframe=True,
-            track_ids=tracks.ids.copy(),
-            left_px=sighting.left_px,
-            left_covariance_px2=sighting.left_covariance,
-            right_px=sighting.right_px,
-            right_covariance_px2=sighting.right_covariance,
-            last_T_this=last_T_this,
-            motion_inliers=inliers,
-            lost=lost,
-        )
+        frame = keyframe_of(view.pair.stamp_ns, tracks.ids, sighting, last_T_this, inliers, lost)
         pose = self._chain_T_keyframe
         added = self.finding.remember(frame, pose, view.pair.left, tracks.raw_px, tracks.points)
         self.memorable = Memorable(settled_tracks(tracks, pose), added)

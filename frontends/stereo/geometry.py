@@ -51,6 +51,13 @@ def median(values: Float) -> float:
     return float(0.5 * (middle[half - 1] + middle[half]))
 
 
+def least_spread(px: Float) -> float:
+    """Standard deviation of pixels (n, 2) where it is least; those in one corner or on one line hold a pose badly."""
+    u, v = (px - px.mean(axis=0)).T
+    uu, uv, vv = (float(product) / (len(px) - 1) for product in (u @ u, u @ v, v @ v))
+    return float(np.sqrt(max(0.5 * (uu + vv) - float(np.hypot(0.5 * (uu - vv), uv)), 0.0)))
+
+
 def rays(px: Float, camera: CameraModel) -> Float:
     """Directions (n, 3) with unit z through ideal pixels (n, 2)."""
     plane = np.ones((len(px), 3))

@@ -70,3 +70,39 @@ def blind_frame(stamp_ns: int, last_T_this: Float) -> StereoFrame:
         motion_inliers=0,
         lost=True,
     )
+
+
+def plain_frame(
+    stamp_ns: int, ids: NDArray[np.int64], left_px: Float, variance_px2: float, last_T_this: Float, inliers: int
+) -> StereoFrame:
+    """A frame between keyframes: ideal left pixels (n, 2) as the flow leaves them."""
+    n = len(ids)
+    return StereoFrame(
+        stamp_ns=stamp_ns,
+        is_keyframe=False,
+        track_ids=ids.copy(),
+        left_px=left_px,
+        left_covariance_px2=np.tile(variance_px2 * np.eye(2), (n, 1, 1)),
+        right_px=np.full((n, 2), np.nan),
+        right_covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+        last_T_this=last_T_this,
+        motion_inliers=inliers,
+    )
+
+
+def keyframe_of(
+    stamp_ns: int, ids: NDArray[np.int64], sighting: Sighting, last_T_this: Float, inliers: int, lost: bool
+) -> StereoFrame:
+    """A keyframe with what was seen of its tracks."""
+    return StereoFrame(
+        stamp_ns=stamp_ns,
+        is_keyframe=True,
+        track_ids=ids.copy(),
+        left_px=sighting.left_px,
+        left_covariance_px2=sighting.left_covariance,
+        right_px=sighting.right_px,
+        right_covariance_px2=sighting.right_covariance,
+        last_T_this=last_T_this,
+        motion_inliers=inliers,
+        lost=lost,
+    )
