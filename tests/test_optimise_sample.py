@@ -88,7 +88,8 @@ def test_a_stream_may_begin_with_the_result(done, result):
     for p in result.points:
         begun = next(q for q in answers[0].points if q.id == p.id)
         np.testing.assert_allclose(begun.position_m, p.position_m, atol=0.05 * p.radius95_m)
-        assert 0.5 < begun.radius95_m / p.radius95_m < 1.05
+        # the memory holds what was stated; the result also what the tracks' residuals say, here 7 % less
+        assert 0.5 < begun.radius95_m / p.radius95_m < 1.1
     for sensed in Sensing(rig).run(LogReader(SAMPLE, wanted_topics(rig))):
         loop.take(sensed)
         if answers[-1].keyframe_ns is not None:
