@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
-from .geometry import point_to_frame
+from .geometry import point_to_frame, seen_from
 from .noise import Model
 
 Float = NDArray[np.float64]
@@ -44,14 +44,6 @@ def depth_moves(points_m: Float, offset_m: float = 0.0, scale: float = 0.0, rays
     return np.asarray(np.stack([*by_depth, *by_rays], axis=2), np.float64)
 
 
-def _moves_along(normal: Float, point_m: Float, offset_m: float, scale: float, rays: Float) -> Float:
-    """One point's `depth_moves` along a direction, shape (5,): a factor is asked for it a hundred times."""
-    (nx, ny, nz), (px, py, pz), (shift_x, shift_y, growth) = normal.tolist(), point_m.tolist(), rays.tolist()
-    by_offset = nx * (px / pz * (1.0 + growth) + shift_x) + ny * (py / pz * (1.0 + growth) + shift_y) + nz
-    depth = 1.0 + scale + offset_m / pz
-    return np.array([by_offset, by_offset * pz, nx * pz * depth, ny * pz * depth, (nx * px + ny * py) * depth])
-
-
 def plane_factor(base: int, landmark: int, plane_point_m: Float, normal: Float, noise: Model) -> gtsam.CustomFactor:
     """`normal . (b_p - c)` = 0 for a landmark p of {o} on the surface through c in {b}.
 
@@ -60,14 +52,14 @@ def plane_factor(base: int, landmark: int, plane_point_m: Float, normal: Float, 
 
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         states = depth_states(values)
-        surface = corrected(plane_point_m, *states)
-        if jacobians is None:
-            return np.array([normal @ (values.atPose3(base).transformTo(values.atPoint3(landmark)) - surface)])
+        if jacobians is None:  # most times
+            b_p = seen_from(values.atPose3(base), values.atPoint3(landmark))
+            return np.array([normal @ (b_p - corrected(plane_point_m, *states))])
         b_p, d_pose, d_point = point_to_frame(values.atPose3(base), values.atPoint3(landmark))
         jacobians[0] = normal[None, :] @ d_pose
         jacobians[1] = normal[None, :] @ d_point
-        moves = -_moves_along(normal, plane_point_m, *states)
+        moves = -normal @ depth_moves(plane_point_m[None], *states)[0]
         jacobians[2], jacobians[3] = moves[None, :2], moves[None, 2:]
-        return np.array([normal @ (b_p - surface)])
+        return np.array([normal @ (b_p - corrected(plane_point_m, *states))])
 
     return gtsam.CustomFactor(noise, [base, landmark, keys.DEPTH, keys.DEPTH_RAYS], error)

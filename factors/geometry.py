@@ -57,8 +57,12 @@ def point_to_frame(a_T_b: gtsam.Pose3, a_p: Float) -> tuple[Float, Float, Float]
     """
     R = a_T_b.rotation().matrix()
     b_p = R.T @ (a_p - a_T_b.translation())
-    x, y, z = b_p.tolist()
-    return b_p, np.array([[0, -z, y, -1, 0, 0], [z, 0, -x, 0, -1, 0], [-y, x, 0, 0, 0, -1]], np.float64), R.T
+    return b_p, np.hstack([skew(b_p), -np.eye(3)]), R.T
+
+
+def seen_from(a_T_b: gtsam.Pose3, a_p: Float) -> Float:
+    """`b_p` of `point_to_frame` alone, to the last bit."""
+    return a_T_b.rotation().matrix().T @ (a_p - a_T_b.translation())
 
 
 def point_from_frame(a_T_b: gtsam.Pose3, b_p: Float) -> tuple[Float, Float, Float]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
-from .geometry import point_to_frame
+from .geometry import point_to_frame, seen_from
 from .measurements import CylinderSighting
 from .noise import Model, gaussian, sigmas
 
@@ -91,20 +91,17 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
-    def ends(values: gtsam.Values) -> tuple[Float, Float]:
-        return values.atPoint3(variables[2]), values.atPoint3(variables[3])
-
-    def visible(values: gtsam.Values) -> float:
-        return float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
-
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
         c_T_s = values.atPose3(variables[6]) if len(variables) == 7 else None
         K = values.atCal3DS2(variables[1]).K()
+        visible = float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
         if jacobians is None:
-            return _distances(line @ K, o_T_c, c_T_s, ends(values)) - visible(values)
-        seen = [_seen(o_T_c, c_T_s, end) for end in ends(values)]
-        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible(values))
+            ends = [seen_from(o_T_c, values.atPoint3(variables[2 + i])) for i in range(2)]
+            ends = ends if c_T_s is None else [seen_from(c_T_s, end) for end in ends]
+            return np.stack(ends) @ line_planes(line[None], K)[0][0] - visible
+        seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
+        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible)
         d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
         jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
         # Edges were fitted in ideal pixels; what the lens model leaves over is far below their sigma.
@@ -118,12 +115,6 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
-
-
-def _distances(plane: Float, o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, points: tuple[Float, Float]) -> Float:
-    """Of points of {o} from a plane through the sensor's centre, with any normal in its frame; shape (2,)."""
-    o_T_s = o_T_c if c_T_s is None else o_T_c.compose(c_T_s)
-    return np.array([plane @ o_T_s.transformTo(p) for p in points]) / np.sqrt(plane @ plane)
 
 
 def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:

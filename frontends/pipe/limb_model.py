@@ -143,34 +143,14 @@ class EdgeModel:
 _TABLES = ("normal", "score", "shift", "shift_sigma", "squares", "variance")
 
 
-_OUTER, _RAMP, _INNER, _RESIDUAL, _STATE = 0, 1, 2, 3, 4
-"""Rows of a stretch, over its pixels: its own levels, what they leave over, and derivatives by the state."""
-_LEVELS, _LEVELS_WANTED, _ROWS = slice(0, 3), slice(0, 4), 4 + 3 + SHADING_TERMS
-_LIMB_FROM, _LIMB_TO, _LIMB_PER_SIGMA = -6.0, 24.0, 40
+def _limb_table() -> tuple[Float, Float]:
+    """sqrt(max(x, 0)) blurred by a Gaussian of sigma 1, tabulated: a parabolic cylinder function (DLMF 12.5.1)."""
+    x = np.linspace(-6.0, 24.0, 1201)
+    return x, gamma(1.5) / np.sqrt(2 * np.pi) * np.exp(-0.25 * x**2) * pbdv(-1.5, -x)[0]
 
 
-def _limb_table() -> Float:
-    """sqrt(max(x, 0)) blurred by a Gaussian of sigma 1, tabulated: a parabolic cylinder function (DLMF 12.5.1).
-
-    Shape (4, n): value, its difference to the next place, slope, and its difference.
-    """
-    x = np.linspace(_LIMB_FROM, _LIMB_TO, int((_LIMB_TO - _LIMB_FROM) * _LIMB_PER_SIGMA) + 1)
-    value = gamma(1.5) / np.sqrt(2 * np.pi) * np.exp(-0.25 * x**2) * pbdv(-1.5, -x)[0]
-    slope = np.gradient(value, x)
-    return np.stack((value[:-1], np.diff(value), slope[:-1], np.diff(slope)))
-
-
-_LIMB = _limb_table()
-
-
-def _limb(x: Float) -> tuple[Float, Float]:
-    """The blurred root and its slope; beyond the table as at its ends."""
-    cells = _LIMB.shape[1]
-    part = np.clip((x - _LIMB_FROM) * _LIMB_PER_SIGMA, 0.0, float(cells))
-    cell = np.minimum(part.astype(np.intp), cells - 1)
-    part -= cell
-    value, rise, slope, bend = (table.take(cell) for table in _LIMB)
-    return value + part * rise, slope + part * bend
+_LIMB_X, _LIMB_Y = _limb_table()
+_LIMB_SLOPE = np.gradient(_LIMB_Y, _LIMB_X)
 
 
 def linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
@@ -186,38 +166,28 @@ def _linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     x = tau / blur
     step, bell = ndtr(x), _bell(x)
     weight, evenness = pixels.weight, pixels.evenness
-    shading = _shading(tau, x, step, bell, pixels.along, blur, pixels.half_width[:, None])
-    shape = len(tau), SHADING_TERMS, -1
-    shade, by_depth, by_width = np.moveaxis(
-        (state.shading[edge, None, :] @ shading.reshape(shape)).reshape(len(tau), 3, -1), 1, 0
-    )
-    # Products of rows with rows are many small ones: all of them at once, first with the levels, then with the rest.
-    rows = np.empty((len(tau), _ROWS, tau.shape[1]))
-    outside, behind = 1 - step, blur * bell
-    rows[:, _OUTER], rows[:, _RAMP], rows[:, _INNER] = outside, behind - tau * outside, step
-    rows[:, _LEVELS] *= weight[:, None]
-    rows[:, _RESIDUAL] = wanted = (pixels.grey - shade) * weight
-    products = rows[:, _LEVELS_WANTED] @ rows[:, _LEVELS_WANTED].transpose(0, 2, 1)
-    gram = products[:, :3, :3]
+    shading, by_depth, by_width = _shading(tau, x, step, bell, pixels.along, blur, pixels.half_width[:, None])
+    coefficients = state.shading[edge, None, :]
+    ramp = -tau * (1 - step) + blur * bell
+    basis = np.stack((1 - step, ramp, step), axis=1) * weight[:, None]
+    gram = basis @ basis.transpose(0, 2, 1)
     # The pipe's grey value goes on along it, to within its own stains: one row more holds each stretch's deviation.
     gram[:, 2, 2] += evenness**2
     inverse = np.linalg.inv(gram + 1e-9 * np.eye(3))
-    level = (inverse @ products[:, :3, 3:])[..., 0]
-    rows[:, _RESIDUAL] = wanted - (level[:, None, :] @ rows[:, _LEVELS])[:, 0]
+    wanted = (pixels.grey - (coefficients @ shading)[:, 0]) * weight
+    level = (inverse @ (basis @ wanted[..., None]))[..., 0]
+    residual = wanted - (level[:, None, :] @ basis)[:, 0]
     jump = (level[:, 2] - level[:, 0])[:, None]
     slope = level[:, 1][:, None]
-    by_tau = jump * bell / blur - slope * outside + by_depth
-    rows[:, _STATE] = by_tau
-    rows[:, _STATE + 1] = -by_tau * pixels.along
-    rows[:, _STATE + 2] = -jump * bell * x + slope * behind + by_width
-    rows[:, _STATE + 3 :] = shading[:, :, 0]
-    rows[:, _STATE:] *= weight[:, None]
-    products = rows @ rows.transpose(0, 2, 1)
-    crossed = products[:, _LEVELS, _STATE:]
-    normal = products[:, _STATE:, _STATE:] - crossed.transpose(0, 2, 1) @ (inverse @ crossed)
-    score = products[:, _STATE:, _RESIDUAL]  # residuals are free of the levels: so need not be the derivatives
+    by_tau = jump * bell / blur - slope * (1 - step) + (coefficients @ by_depth)[:, 0]
+    by_blur = -jump * bell * x + slope * bell * blur + (coefficients @ by_width)[:, 0]
+    jacobian = np.concatenate((np.stack((by_tau, -by_tau * pixels.along, by_blur), axis=1), shading), axis=1)
+    jacobian *= weight[:, None]
+    crossed = basis @ jacobian.transpose(0, 2, 1)
+    normal = jacobian @ jacobian.transpose(0, 2, 1) - crossed.transpose(0, 2, 1) @ (inverse @ crossed)
+    score = (jacobian @ residual[..., None])[..., 0]  # residuals are free of the levels: so need not be the derivatives
     freedom = np.maximum(weight.sum(axis=1) - 4, 1)
-    squares = products[:, _RESIDUAL, _RESIDUAL] + (evenness * level[:, 2]) ** 2
+    squares = (residual**2).sum(axis=1) + (evenness * level[:, 2]) ** 2
     variance = np.maximum(squares / freedom, pixels.noise**2)
     strength = np.maximum(normal[:, 0, 0], 1e-9)
     return EdgeModel(normal, score, score[:, 0] / strength, np.sqrt(variance / strength), squares, variance)
@@ -227,9 +197,11 @@ def _bell(x: Float) -> Float:
     return np.exp(-0.5 * x**2) * (1 / np.sqrt(2 * np.pi))
 
 
-def _shading(tau: Float, x: Float, step: Float, bell: Float, along: Float, blur: Float, half_width: Float) -> Float:
-    """What the shading inside may look like, blurred, shape (stretches, terms, 3, n): terms, their derivatives by depth
-    and by log blur.
+def _shading(
+    tau: Float, x: Float, step: Float, bell: Float, along: Float, blur: Float, half_width: Float
+) -> tuple[Float, Float, Float]:
+    """What the shading inside may look like, blurred: terms, their derivatives by depth and by log blur, shape
+    (stretches, terms, n) each.
 
     The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
     shadow or a highlight begins, stand for the rest.
@@ -237,19 +209,19 @@ def _shading(tau: Float, x: Float, step: Float, bell: Float, along: Float, blur:
     Args:
         x: `tau / blur`, with its normal distribution `step` and density `bell`.
     """
-    tables = np.empty((len(tau), SHADING_TERMS, 3, tau.shape[1]))
-    terms, by_depth, by_width = tables[:, :, 0], tables[:, :, 1], tables[:, :, 2]
+    terms, by_depth, by_width = (np.empty((len(tau), SHADING_TERMS, tau.shape[1])) for _ in range(3))
+    here = along / _TREND_PX
     terms[:, 0], by_depth[:, 0], by_width[:, 0] = step, bell / blur, -bell * x
-    tables[:, 1] = tables[:, 0] * (along / _TREND_PX)[:, None]
+    for table in (terms, by_depth, by_width):
+        table[:, 1] = table[:, 0] * here
     scale = np.sqrt(blur * (2 - np.clip(tau / half_width, 0, 1)) / half_width)
-    root, slope = _limb(x)
-    root *= scale
-    slope *= scale / blur
-    terms[:, 2], by_depth[:, 2], by_width[:, 2] = root, slope, 0.5 * root - slope * tau
+    root = scale * np.interp(x, _LIMB_X, _LIMB_Y)
+    root_slope = scale * np.interp(x, _LIMB_X, _LIMB_SLOPE) / blur
+    terms[:, 2], by_depth[:, 2], by_width[:, 2] = root, root_slope, 0.5 * root - root_slope * tau
     for i, start in enumerate(_KINKS_PX, 3):
         y = x - start / blur
         beyond, density = (step, bell) if start == 0.0 else (ndtr(y), _bell(y))
         terms[:, i] = ((tau - start) * beyond + blur * density) / half_width
         by_depth[:, i] = beyond / half_width
         by_width[:, i] = blur * density / half_width
-    return tables
+    return terms, by_depth, by_width
