@@ -7,23 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from ..factors.geometry import pose3
 from ..factors.measurements import Event, MarkerSighting, StereoFrame
-from ..frontends.resection import camera_pose
 from .boards import Boards
 from .graph import Update
 from .odometry import Odometry
 from .open_graph import OpenGraph
-from .placement import place
+from .placement import place, place_by_landmarks
 from .strand import Strand
 
 Float = NDArray[np.float64]
 Part = Callable[[int], bool]
 """Is a variable in a part of the map?"""
 
-ANCHOR_PX = 2.0
-"""Largest median reprojection error of landmarks of before."""
-ANCHOR_LANDMARKS = 12
 REACH = 5.0
 """Sigmas of the motion prior beyond which a camera has not gone."""
 SHORT_S = 0.2
@@ -209,17 +204,8 @@ class Adrift:
 
     def _by_landmarks(self, part: Part, frame: StereoFrame) -> gtsam.Pose3 | None:
         """From landmarks that the front end has found again."""
-        state, old = self._graph.state, []
-        for row, track in enumerate(frame.track_ids.tolist()):
-            key = keys.landmark(track)
-            if state.has(key) and part(key):
-                old.append((row, state.point(key)))
-        if len(old) < ANCHOR_LANDMARKS:
-            return None
-        px = frame.left_px[[row for row, _ in old]]
-        K = state.intrinsics(keys.intrinsics("m_left")).K()
-        found = camera_pose(np.array([point for _, point in old]), px, K)
-        return None if found is None or found[1] > ANCHOR_PX else pose3(found[0])
+        wanted = {track for track in frame.track_ids.tolist() if part(keys.landmark(track))}
+        return place_by_landmarks(self._graph.state, frame, wanted)
 
     # What a user has to know ----------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Where a keyframe without tracks stands: from the corners of known boards in either mobile camera."""
+"""Where a keyframe without tracks stands: from corners of known boards in either mobile camera, or from landmarks."""
 
 from collections.abc import Container, Sequence
 
