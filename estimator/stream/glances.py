@@ -15,6 +15,11 @@ from ...factors.rig import Rig
 from ...frontends.fiducials.detector import MarkerFrontEnd
 from .settings import StreamSettings
 
+RECENT = 5
+"""Periods within which a board that was seen should still be in view: small markers are missed in one image of three."""
+SOONER = 4
+"""A look that missed it is repeated so many times sooner."""
+
 
 @dataclass(frozen=True, slots=True)
 class Glance:
@@ -33,6 +38,8 @@ class Glances:
         self._front_end: MarkerFrontEnd | None = None
         self._last_ns = 0
         """The last time that boards were looked for."""
+        self._seen_ns = 0
+        """The last time that one was seen in a glance."""
 
     def due(self, frame: StereoFrame) -> bool:
         """Is it time for one? A keyframe is looked at anyway."""
@@ -46,4 +53,9 @@ class Glances:
         self._last_ns = frame.stamp_ns
         if self._front_end is None:
             self._front_end = MarkerFrontEnd(self._rig, camera, "m_left")
-        return Glance(frame, tuple(self._front_end.process(frame.stamp_ns, left)[0]))
+        sightings = tuple(self._front_end.process(frame.stamp_ns, left)[0])
+        if sightings:
+            self._seen_ns = frame.stamp_ns
+        elif frame.stamp_ns - self._seen_ns < RECENT * self._period_ns:
+            self._last_ns -= self._period_ns - self._period_ns // SOONER
+        return Glance(frame, sightings)

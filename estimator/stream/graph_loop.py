@@ -15,6 +15,7 @@ from ...factors.measurements import Pick
 from ...factors.rig import Rig, sha256_of
 from ..aside import Aside
 from ..bounded import Bounded
+from ..bundle import Bundle
 from ..decision import Decision, decide
 from ..pipeline import Pipeline
 from ..points_in_base import pipe_estimate, point_blocks, radius95
@@ -109,6 +110,7 @@ class GraphLoop:
             raise SurecutError(f"at {sensed.stamp_ns} ns: {error}") from error
         new = self.engine.odometry.last_keyframe > before
         clicked = bool(sensed.bundle.picks)
+        drifted |= new and self._off_its_place(sensed.bundle)
         self._changed |= new or clicked or drifted or self._told() != told
         self.counts["frames"] += sensed.bundle.frame is not None
         self.counts["keyframes"] += new
@@ -117,6 +119,17 @@ class GraphLoop:
         if self._bounded.tidy():
             give_back()
         self._answer_when_due(sensed.stamp_ns, False, busy)
+
+    def _off_its_place(self, bundle: Bundle) -> bool:
+        """A keyframe is a glance too: True when it changes what is suspected."""
+        left = tuple(sighting for sighting in bundle.sightings if sighting.camera == "m_left")
+        if bundle.frame is None or not left:
+            return False
+        try:
+            return self._knocks.see(Glance(bundle.frame, left))
+        except ObservabilityError:
+            self.counts["undetermined"] += 1
+            return False
 
     def _told(self) -> tuple[int, int]:
         """Changes with each factor that enters or leaves."""
