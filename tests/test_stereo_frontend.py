@@ -34,7 +34,14 @@ def rendered():
     return poses, [room.pair(o_T_m) for o_T_m in poses]
 
 
-DENSE = StereoSettings(keyframe_parallax=0.05, keyframe_rotation_rad=0.12, keyframe_share=0.75, min_tracks=90)
+DENSE = StereoSettings(
+    focal_sigma_rel=0.0,
+    centre_sigma_px=0.0,
+    keyframe_parallax=0.05,
+    keyframe_rotation_rad=0.12,
+    keyframe_share=0.75,
+    min_tracks=90,
+)
 """Keyframes enough in a walk of two seconds for statistics over them."""
 
 
