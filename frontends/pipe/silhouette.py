@@ -13,7 +13,7 @@ from ..undistort import distort, undistort
 from .edges import EdgeLine, image_noise, straight_lines
 from .limb import EdgeFit, EdgeSeed, confirmed_edges, fit_edges
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
-from .surface import occlusion_score, region_edges, region_score, sampled
+from .surface import MOST_BY_REGION, occlusion_score, region_edges, region_scores, sampled
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -47,6 +47,7 @@ _NO_FIT = 3.0
 _NEAR_FITTED_PX, _NEAR_SEEDS_PX = 0.5, 1.6
 _REGIONS = 30
 """Hypotheses whose inside is looked at."""
+_REGIONS_AT_ONCE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +113,12 @@ class OutlineFinder:
         patch, centre = self._ideal_patch(image, prior.centre_px)
         lines = straight_lines(patch, centre, noise, self._widest(prior), self._angles(prior))
         lines += self._textured(patch, centre, lines, prior)
-        pairs = edge_pairs(lines, prior, self._camera.fx, config.limits)
-        pairs = [self._filled(pair, patch, prior.centre_px - centre, prior.centre_px) for pair in pairs[:_REGIONS]]
-        pairs.sort(key=lambda pair: -pair.score)
+        pairs = edge_pairs(lines, prior, self._camera.fx, config.limits, _REGIONS)
+        pairs = self._filled(pairs, patch, prior.centre_px - centre, prior)
         if not pairs:
             return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
         window = _Window(grey.astype(float).ravel(), self._ideal[rows, columns].reshape(-1, 2), noise)
-        found = self._refined(pairs, window, prior)
+        found = _refined(pairs, window, prior)
         found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
         found = _confirmed(_outermost(sorted(found, key=lambda f: -f.score)), window)
         return self._decide(stamp_ns, pipe_id, found, prior)
@@ -153,30 +153,6 @@ class OutlineFinder:
             return None
         return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
 
-    def _refined(self, pairs: list[EdgePair], window: _Window, prior: OutlinePrior) -> list[_Found]:
-        known = prior.half_width_px is not None
-        pairs = pairs[: self._config.refined_known if known else self._config.refined_pairs]
-        seeds: dict[tuple[int, bool], EdgeSeed] = {}
-        keys = []
-        for pair in pairs:
-            for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
-                key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
-                keys.append(key)
-                seeds.setdefault(key, _seed(line, edge.span if key[1] else (-edge.span[1], -edge.span[0]), prior, pair))
-        fits = dict(zip(seeds, fit_edges(window.grey, window.px, [*seeds.values()], window.noise), strict=True))
-        found = []
-        for pair, first, second in zip(pairs, keys[::2], keys[1::2], strict=True):
-            one, other, both = fits[first], fits[second], (seeds[first], seeds[second])
-            if one is None or other is None:
-                found.append(_Found(pair, None, both, pair.score - _NO_FIT))
-            else:
-                found.append(_Found(pair, (one, other), both, pair.score))
-        blur = _sharp_blur(fits.values())
-        return [
-            f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
-            for f in found
-        ]
-
     def _textured(
         self, patch: NDArray[np.float32], centre: Float, lines: list[EdgeLine], prior: OutlinePrior
     ) -> list[EdgeLine]:
@@ -194,10 +170,21 @@ class OutlineFinder:
                 found.append(EdgeLine(turned, sign * rho, (-40.0, 40.0), min(evidence, 12.0)))
         return found
 
-    @staticmethod
-    def _filled(pair: EdgePair, patch: NDArray[np.float32], origin: Float, core_px: Float) -> EdgePair:
-        region = region_score(patch, origin, pair.lines, core_px, 0.5 * pair.width_px)
-        return replace(pair, score=pair.score + region, region=region)
+    def _filled(
+        self, pairs: list[EdgePair], patch: NDArray[np.float32], origin: Float, prior: OutlinePrior
+    ) -> list[EdgePair]:
+        """The hypotheses that are best with what the region between their edges says, best first."""
+        most = self._config.refined_pairs if prior.half_width_px is None else self._config.refined_known
+        best: list[EdgePair] = []
+        for i in range(0, len(pairs), _REGIONS_AT_ONCE):
+            if len(best) == most and pairs[i].score + MOST_BY_REGION < best[-1].score:
+                break  # no other can reach these
+            some = pairs[i : i + _REGIONS_AT_ONCE]
+            half_width = 0.5 * np.array([pair.width_px for pair in some])
+            region = region_scores(patch, origin, np.array([pair.lines for pair in some]), prior.centre_px, half_width)
+            best += [replace(p, score=p.score + r, region=r) for p, r in zip(some, region.tolist(), strict=True)]
+            best = sorted(best, key=lambda pair: -pair.score)[:most]
+        return best
 
     @staticmethod
     def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
@@ -267,6 +254,28 @@ class OutlineFinder:
 
     def _refuse(self, stamp_ns: int, pipe_id: str, reason: str, value: float, limit: float) -> Rejection:
         return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
+
+
+def _refined(pairs: list[EdgePair], window: _Window, prior: OutlinePrior) -> list[_Found]:
+    seeds: dict[tuple[int, bool], EdgeSeed] = {}
+    keys = []
+    for pair in pairs:
+        for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
+            key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
+            keys.append(key)
+            seeds.setdefault(key, _seed(line, edge.span if key[1] else (-edge.span[1], -edge.span[0]), prior, pair))
+    fits = dict(zip(seeds, fit_edges(window.grey, window.px, [*seeds.values()], window.noise), strict=True))
+    found = []
+    for pair, first, second in zip(pairs, keys[::2], keys[1::2], strict=True):
+        one, other, both = fits[first], fits[second], (seeds[first], seeds[second])
+        if one is None or other is None:
+            found.append(_Found(pair, None, both, pair.score - _NO_FIT))
+        else:
+            found.append(_Found(pair, (one, other), both, pair.score))
+    blur = _sharp_blur(fits.values())
+    return [
+        f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits)) for f in found
+    ]
 
 
 def _seed(line: Float, span: tuple[float, float], prior: OutlinePrior, pair: EdgePair) -> EdgeSeed:
