@@ -108,7 +108,7 @@ class _Running:
 def converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
     """Levenberg-Marquardt in three stages (see `information`), and which edges did not run away."""
     good = np.ones(pixels.edges, bool)
-    final = EdgeStates.start(len(good))
+    final = EdgeStates.start(len(good)).values
     running = _Running.start(pixels)
     for iteration in range(_ITERATIONS):
         prior = information(iteration // _STAGE)
@@ -120,14 +120,14 @@ def converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
         if not len(running.number):
             break
         running, better = running.gone_on(trial, prior)
-        final = final.with_those(running.number, running.state)
+        final[running.number] = running.state.values
         lost = better & (running.stretches.each @ running.weights < 1.5)
         good[running.number[lost]] = False
         still = (np.abs(step[:, 0]) < _SMALL_PX) & (np.abs(step[:, 1]) < _SMALL_RAD)
         running = running.only(~lost & ~(still & (iteration > LAST_STAGE * _STAGE)))
         if not len(running.number):
             break
-    return final, good
+    return EdgeStates(final), good
 
 
 def stretch_weights(stretches: Stretches, linear: EdgeModel) -> Float:

@@ -20,9 +20,11 @@ Real = NDArray[np.floating]
 _LOG_BLUR_RANGE = (float(np.log(0.4)), float(np.log(1.2)))
 """A pixel alone blurs by 0.3 px. Edges softer than 1.2 px are shading or out of focus."""
 _USUAL_LOG_BLUR = float(np.log(0.6))
-_KINKS_PX = (0.0, 1.8, 3.2)
-"""Depths at which the shading may change its slope."""
+_KINKS_PX = np.array((0.0, 1.8, 3.2))[:, None, None]
+"""Depths at which the shading may change its slope; the first is the edge."""
 SHADING_TERMS = 3 + len(_KINKS_PX)
+_USUAL = np.array((0.0, 0.0, _USUAL_LOG_BLUR, *[0.0] * SHADING_TERMS))
+_LONGEST_STEP = np.array((0.7, 0.03, 0.3, *[np.inf] * SHADING_TERMS))
 _TREND_PX = 40.0
 _BLOCK = 128
 """Stretches that are worked on together: so many fit into a processor's cache."""
@@ -30,49 +32,49 @@ _BLOCK = 128
 
 @dataclass(frozen=True, slots=True)
 class EdgeStates:
-    """What is fitted, of all edges together, shape (edges,) each."""
+    """What is fitted, of all edges together."""
 
-    offset: Float
-    turn: Float
-    log_blur: Float
-    shading: Float
-    """(edges, terms), coefficients of `_shading`, grey values at full depth."""
+    values: Float
+    """(edges, parameters): offset, turn, log blur, and coefficients of `_shading`, grey values at full depth."""
 
     @classmethod
     def start(cls, edges: int) -> "EdgeStates":
-        zero = np.zeros(edges)
-        return cls(zero, zero, zero + _USUAL_LOG_BLUR, np.zeros((edges, SHADING_TERMS)))
+        return cls(np.tile(_USUAL, (edges, 1)))
 
-    def moved(self, step: NDArray[np.floating]) -> "EdgeStates":
-        log_blur = np.clip(self.log_blur + np.clip(step[:, 2], -0.3, 0.3), *_LOG_BLUR_RANGE)
-        offset = self.offset + np.clip(step[:, 0], -0.7, 0.7)
-        return EdgeStates(offset, self.turn + np.clip(step[:, 1], -0.03, 0.03), log_blur, self.shading + step[:, 3:])
+    @property
+    def offset(self) -> Float:
+        """(edges,), px outwards"""
+        return self.values[:, 0]
+
+    @property
+    def turn(self) -> Float:
+        return self.values[:, 1]
+
+    @property
+    def log_blur(self) -> Float:
+        return self.values[:, 2]
+
+    @property
+    def shading(self) -> Float:
+        """(edges, terms)"""
+        return self.values[:, 3:]
+
+    def moved(self, step: Float) -> "EdgeStates":
+        """By steps (edges, parameters), but by no more than what is plausible."""
+        values = self.values + np.minimum(np.maximum(step, -_LONGEST_STEP), _LONGEST_STEP)
+        values[:, 2] = np.minimum(np.maximum(values[:, 2], _LOG_BLUR_RANGE[0]), _LOG_BLUR_RANGE[1])
+        return EdgeStates(values)
 
     def only(self, edges: NDArray[np.bool_]) -> "EdgeStates":
-        return EdgeStates(self.offset[edges], self.turn[edges], self.log_blur[edges], self.shading[edges])
+        return EdgeStates(self.values[edges])
 
     def where(self, taken: NDArray[np.bool_], other: "EdgeStates") -> "EdgeStates":
         """This state for the edges that are taken, the other's for the rest."""
-        if taken.all():
-            return self
-        return EdgeStates(
-            np.where(taken, self.offset, other.offset),
-            np.where(taken, self.turn, other.turn),
-            np.where(taken, self.log_blur, other.log_blur),
-            np.where(taken[:, None], self.shading, other.shading),
-        )
-
-    def with_those(self, edges: NDArray[np.int64], others: "EdgeStates") -> "EdgeStates":
-        """This state with others for some edges, as many as there are others."""
-        tables = [t.copy() for t in (self.offset, self.turn, self.log_blur, self.shading)]
-        for table, new in zip(tables, (others.offset, others.turn, others.log_blur, others.shading), strict=True):
-            table[edges] = new
-        return EdgeStates(*tables)
+        return EdgeStates(np.where(taken[:, None], self.values, other.values))
 
     def deviation(self) -> Float:
         """From the priors' means, (edges, parameters)."""
-        zero = np.zeros((len(self.offset), 2))
-        return np.column_stack((zero, self.log_blur - _USUAL_LOG_BLUR, self.shading))
+        return self.values - _USUAL
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,11 +196,11 @@ def _linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     places = _Places.at(pixels, state)
     shading = _shading(places, pixels)
     coefficients = state.shading[edge, None, :].astype(precision)
-    shade, by_depth, by_width = ((coefficients @ table.transpose(1, 0, 2))[:, 0] for table in shading)
+    shade, by_depth, by_width = (coefficients @ shading.transpose(0, 2, 1, 3))[:, :, 0]
     rows = np.empty((_ROWS, *weight.shape), precision)
-    outside = np.subtract(1, places.step, out=rows[_OUTER])
-    np.subtract(places.spread, places.tau * outside, out=rows[_RAMP])
-    rows[_INNER] = places.step
+    outside = np.subtract(1, places.step[0], out=rows[_OUTER])
+    np.subtract(places.spread[0], places.depth[0] * outside, out=rows[_RAMP])
+    rows[_INNER] = places.step[0]
     rows[:_RESIDUAL] *= weight
     wanted = np.multiply(pixels.grey - shade, weight, out=rows[_RESIDUAL])
     level, inverse = _levels(rows, pixels.evenness)
@@ -206,7 +208,7 @@ def _linearised(pixels: EdgePixels, state: EdgeStates) -> EdgeModel:
     jump, slope = (t.astype(precision)[:, None] for t in (level[:, 2] - level[:, 0], level[:, 1]))
     by_tau = np.add(jump * places.density - slope * outside, by_depth, out=rows[_BY_STATE])
     np.multiply(by_tau, -pixels.along, out=rows[_BY_STATE + 1])
-    np.add(slope * places.spread - jump * places.widening, by_width, out=rows[_BY_STATE + 2])
+    np.add(slope * places.spread[0] - jump * places.widening, by_width, out=rows[_BY_STATE + 2])
     rows[_BY_STATE + 3 :] = shading[0]
     rows[_BY_STATE:] *= weight
     return _projected(rows, level, inverse, pixels)
@@ -239,19 +241,23 @@ def _projected(rows: Real, level: Float, inverse: Float, pixels: EdgePixels) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where pixels are across the edge, and blurred functions there, shape (stretches, n)."""
+    """Where pixels are across the edge, and blurred functions there.
 
-    tau: Real
-    """Depth within the edge, px."""
+    Shape (kinks, stretches, n) by the distance from each kink of the shading, the first of which is the edge itself;
+    (stretches, n) of the edge alone.
+    """
+
+    depth: Real
+    """Within each kink, px."""
     blur: Real
     """(stretches, 1), px."""
     step: Real
-    density: Real
-    """Derivative of the step by depth."""
-    widening: Real
-    """Its derivative by log blur, negative."""
     spread: Real
     """Derivative of a ramp by log blur."""
+    density: Real
+    """Derivative of the edge's step by depth."""
+    widening: Real
+    """Its derivative by log blur, negative."""
     root: Real
     slope: Real
 
@@ -264,20 +270,22 @@ class _Places:
         )
         tau = pixels.depth - turn * pixels.along
         tau += offset
-        x = tau * (1 / blur)
+        depth = tau - _KINKS_PX.astype(precision)
+        x = depth * (1 / blur)
         bell = _bell(x)
         cell, left = _nearest(x)
-        slope = table.slope.take(cell, mode="clip")
-        root = table.root.take(cell, mode="clip") + left * slope
-        step = table.step.take(cell, mode="clip") + left * bell
-        return cls(tau, blur, step, bell * (1 / blur), bell * x, bell * blur, root, slope)
+        slope = table.slope.take(cell[0], mode="clip")
+        root = table.root.take(cell[0], mode="clip") + left[0] * slope
+        left *= bell
+        step = table.step.take(cell, mode="clip")
+        step += left
+        return cls(depth, blur, step, bell * blur, bell[0] * (1 / blur), bell[0] * x[0], root, slope)
 
 
 def _nearest(x: Real) -> tuple[NDArray[np.intp], Real]:
-    """The nearest place of the table, and what is left; beyond the table as at its ends."""
-    place = np.clip(x, _FROM, _TO)
-    place -= _FROM
-    place *= _PER_SIGMA
+    """The nearest place of the table, and how far off it is; beyond the table there is nothing but straight lines."""
+    place = x * _PER_SIGMA
+    place -= _FROM * _PER_SIGMA
     cell = np.rint(place)
     place -= cell
     place *= 1 / _PER_SIGMA
@@ -299,29 +307,25 @@ def _shading(places: _Places, pixels: EdgePixels) -> Real:
     The root term is the face that turns away from the viewer at the limb; a slope, and kinks where the pipe's own
     shadow or a highlight begins, stand for the rest.
     """
-    tau, blur = places.tau, places.blur
-    table = _SINGLE if tau.dtype == np.float32 else _DOUBLE
+    tau, blur = places.depth[0], places.blur
     shading = np.empty((3, SHADING_TERMS, *tau.shape), tau.dtype)
     terms, by_depth, by_width = shading
-    terms[0], by_depth[0] = places.step, places.density
+    terms[0], by_depth[0] = places.step[0], places.density
     np.negative(places.widening, out=by_width[0])
     np.multiply(shading[:, 0], pixels.along * (1 / _TREND_PX), out=shading[:, 1])
     one = (1 / pixels.half_width).astype(tau.dtype)[:, None]
-    scale = np.sqrt((2 - np.clip(tau * one, 0, 1)) * (blur * one))
+    scale = np.maximum(tau * -one, -1)
+    np.minimum(scale, 0, out=scale)
+    scale += 2
+    scale *= blur * one
+    np.sqrt(scale, out=scale)
     root = np.multiply(places.root, scale, out=terms[2])
     scale *= 1 / blur
     slope = np.multiply(places.slope, scale, out=by_depth[2])
     np.subtract(0.5 * root, slope * tau, out=by_width[2])
-    for i, start in enumerate(_KINKS_PX, 3):
-        if start == 0.0:
-            deeper, beyond, spread = tau, places.step, places.spread
-        else:
-            deeper = tau - start
-            y = deeper * (1 / blur)
-            bell = _bell(y)
-            cell, left = _nearest(y)
-            beyond, spread = table.step.take(cell, mode="clip") + left * bell, bell * blur
-        np.multiply(beyond, one, out=by_depth[i])
-        np.multiply(spread, one, out=by_width[i])
-        np.add(deeper * by_depth[i], by_width[i], out=terms[i])
+    kinks = slice(3, None)
+    np.multiply(places.step, one, out=by_depth[kinks])
+    np.multiply(places.spread, one, out=by_width[kinks])
+    np.multiply(places.depth, by_depth[kinks], out=terms[kinks])
+    terms[kinks] += by_width[kinks]
     return shading
