@@ -56,35 +56,43 @@ class EdgeSeed:
     """Half the pipe's width in the image."""
 
 
-def fit_edges(grey: Real, px: Float, seeds: Sequence[EdgeSeed], noise: float) -> list[EdgeFit | None]:
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The pixels about a place of an image."""
+
+    grey: Real
+    """(n,)"""
+    px: Float
+    """(n, 2), ideal."""
+    noise: float
+    """White noise of the image, grey values."""
+
+
+Looked = Sequence[tuple[Window, EdgeSeed]]
+"""Edges, and the pixels that each is looked for in."""
+
+
+def fit_edges(looked: Looked) -> list[EdgeFit | None]:
     """Fits occluding edges, each near its seed; all of them at once, because one alone is too little work for NumPy.
 
-    Args:
-        grey: Shape (n,), grey values of the pixels around the edges.
-        px: Shape (n, 2), their ideal pixels.
-        seeds: Where to look.
-        noise: White noise of the image, grey values.
-
     Returns:
-        Per seed; None where the grey values do not hold such an edge. What is to be used as a measurement wants
+        Per edge; None where the grey values do not hold such an edge. What is to be used as a measurement wants
         `confirmed_edges` as well.
     """
-    found = _fitted(grey, px, seeds, noise, _WIDE)
-    return [None if one is None else _result(seed, one) for seed, one in zip(seeds, found, strict=True)]
+    found = _fitted(looked, _WIDE)
+    return [None if one is None else _result(seed, one) for (_, seed), one in zip(looked, found, strict=True)]
 
 
-def confirmed_edges(
-    grey: Real, px: Float, seeds: Sequence[EdgeSeed], fits: Sequence[EdgeFit], noise: float
-) -> list[EdgeFit | None]:
+def confirmed_edges(looked: Looked, fits: Sequence[EdgeFit]) -> list[EdgeFit | None]:
     """The same edges fitted in a narrower window: what the two do not agree on is the model's error, not noise.
 
     Returns:
         The given fits with a covariance that holds the disagreement; None where the narrow window finds no edge.
     """
-    found = _fitted(grey, px, seeds, noise, _NARROW)  # from the seeds again: who ends elsewhere is unsure
+    found = _fitted(looked, _NARROW)  # from the seeds again: who ends elsewhere is unsure
     return [
         None if one is None else replace(fit, covariance=fit.covariance + _disagreement(seed, fit, one.state))
-        for seed, fit, one in zip(seeds, fits, found, strict=True)
+        for (_, seed), fit, one in zip(looked, fits, found, strict=True)
     ]
 
 
@@ -99,16 +107,13 @@ class _Converged:
     """(stretches,)"""
 
 
-def _fitted(
-    grey: Real, px: Float, seeds: Sequence[EdgeSeed], noise: float, window: tuple[float, float]
-) -> list[_Converged | None]:
-    """Every edge where its fit converges."""
-    noise = max(noise, 0.3)
-    gathered = [_gather(grey, px, seed, noise, window) for seed in seeds]
+def _fitted(looked: Looked, reach_px: tuple[float, float]) -> list[_Converged | None]:
+    """Every edge where its fit converges, by the pixels so far outside and inside."""
+    gathered = [_gather(window, seed, reach_px) for window, seed in looked]
     parts = [table for table in gathered if table is not None]
     if not parts:
-        return [None] * len(seeds)
-    pixels = _joined(parts, noise)
+        return [None] * len(looked)
+    pixels = _joined(parts)
     state, good = converged(pixels)
     pixels = pixels.double()
     linear = linearised(pixels, state)
@@ -133,10 +138,11 @@ def _disagreement(seed: EdgeSeed, fit: EdgeFit, other: EdgeStates) -> Float:
     return np.diag([(offset - float(other.offset[0])) ** 2, (turn - float(other.turn[0])) ** 2])
 
 
-def _gather(grey: Real, px: Float, seed: EdgeSeed, noise: float, window: tuple[float, float]) -> EdgePixels | None:
+def _gather(window: Window, seed: EdgeSeed, reach_px: tuple[float, float]) -> EdgePixels | None:
     """The pixels on both sides of a seed, by stretch."""
+    grey, px, noise = window.grey, window.px, max(window.noise, 0.3)
     line, span = seed.line, seed.span
-    outside, deepest = window
+    outside, deepest = reach_px
     inside = float(np.clip(0.8 * seed.half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
     near = np.flatnonzero((depth > -outside) & (depth < inside))
@@ -156,29 +162,24 @@ def _gather(grey: Real, px: Float, seed: EdgeSeed, noise: float, window: tuple[f
         table[i, stretch[order], place] = values[order]
     values, depths, places, weight = table[:, full]
     evenness = noise / _stains(values, depths, places, weight, inside)
-    same = np.ones(len(values))
-    return EdgePixels(
-        values, depths, places, weight, seed.half_width_px * same, evenness * same, same.astype(np.int64) * 0, noise
-    )
+    half_width, evenness, noises = (np.full(len(values), v) for v in (seed.half_width_px, evenness, noise))
+    return EdgePixels(values, depths, places, weight, half_width, evenness, np.zeros(len(values), np.int64), noises)
 
 
-def _joined(parts: list[EdgePixels], noise: float) -> EdgePixels:
+def _joined(parts: list[EdgePixels]) -> EdgePixels:
     """Several edges in one table."""
-    width = max(part.grey.shape[1] for part in parts)
-
-    def padded(tables: list[Real]) -> Real:
-        return np.concatenate([np.pad(t, ((0, 0), (0, width - t.shape[1]))) for t in tables])
-
-    return EdgePixels(
-        padded([p.grey for p in parts]),
-        padded([p.depth for p in parts]),
-        padded([p.along for p in parts]),
-        padded([p.weight for p in parts]),
-        np.concatenate([p.half_width for p in parts]),
-        np.concatenate([p.evenness for p in parts]),
-        np.repeat(np.arange(len(parts)), [len(p.edge) for p in parts]),
-        noise,
+    count = [len(part.edge) for part in parts]
+    ends = np.cumsum(count)
+    table = np.zeros((4, ends[-1], max(part.grey.shape[1] for part in parts)), np.float32)
+    for part, end in zip(parts, ends, strict=True):
+        stretches, n = part.grey.shape
+        table[:, end - stretches : end, :n] = part.grey, part.depth, part.along, part.weight
+    half_width, evenness, noise = (
+        np.concatenate(t) for t in zip(*((p.half_width, p.evenness, p.noise) for p in parts), strict=True)
     )
+    grey, depth, along, weight = table
+    edge = np.repeat(np.arange(len(parts)), count)
+    return EdgePixels(grey, depth, along, weight, half_width, evenness, edge, noise)
 
 
 def _stains(grey: Real, depth: Real, along: Real, weight: Real, inside: float) -> float:

@@ -93,7 +93,8 @@ class EdgePixels:
     """(stretches,), white noise over how much the pipe's own grey value varies from stretch to stretch."""
     edge: NDArray[np.int64]
     """(stretches,), which edge a stretch belongs to."""
-    noise: float
+    noise: Float
+    """(stretches,), white noise of the image, grey values."""
 
     @property
     def edges(self) -> int:
@@ -110,14 +111,15 @@ class EdgePixels:
         part = slice(start, stop)
         grey, depth, along, weight = (t[part] for t in (self.grey, self.depth, self.along, self.weight))
         half_width, evenness = self.half_width[part], self.evenness[part]
-        return EdgePixels(grey, depth, along, weight, half_width, evenness, self.edge[part], self.noise)
+        return EdgePixels(grey, depth, along, weight, half_width, evenness, self.edge[part], self.noise[part])
 
     def only(self, edges: NDArray[np.bool_]) -> "EdgePixels":
         """The pixels of some edges, (edges,), which are numbered anew."""
         keep = edges[self.edge]
         grey, depth, along, weight = (t[keep] for t in (self.grey, self.depth, self.along, self.weight))
         number = (np.cumsum(edges) - 1)[self.edge[keep]]
-        return EdgePixels(grey, depth, along, weight, self.half_width[keep], self.evenness[keep], number, self.noise)
+        half_width, evenness, noise = self.half_width[keep], self.evenness[keep], self.noise[keep]
+        return EdgePixels(grey, depth, along, weight, half_width, evenness, number, noise)
 
 
 @dataclass(frozen=True, slots=True)
