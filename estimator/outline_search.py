@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..factors.measurements import OutlineSighting, Pick, Rejection
 from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import part_in_sight, predict_outline
-from ..frontends.pipe.silhouette import OutlineFinder
+from ..frontends.pipe.silhouette import OutlineFinder, OutlineView, find_outlines
 from .engine import Engine
 from .pipe_widths import KeptView, PipeWidths
 from .pipes import AXIS_ROLES, INSET_SHARE
@@ -98,10 +98,8 @@ class OutlineSearch:
         number = len(self._ahead)
         if self._at_once is not None and not to_the_end:
             number = min(number, self._at_once)
-        for _ in range(number):
-            view = self._ahead.popleft()
-            finder = self._finder(view.camera)
-            self._found.append(finder.find(view.pair.stamp_ns, view.pipe, view.pair.of(view.camera), view.prior))
+        views = [self._ahead.popleft() for _ in range(number)]
+        self._found += find_outlines([self._outline_view(view) for view in views])
         if self._found and not self._ahead:
             for found in self._found:
                 self._take(found)
@@ -212,6 +210,10 @@ class OutlineSearch:
             self._engine.add_outline(found)
         else:
             self._engine.rejected.append(found)
+
+    def _outline_view(self, view: _View) -> OutlineView:
+        image, finder = view.pair.of(view.camera), self._finder(view.camera)
+        return OutlineView(finder, view.pair.stamp_ns, view.pipe, image, view.prior)
 
     def _finder(self, camera: str) -> OutlineFinder:
         if camera not in self._finders:

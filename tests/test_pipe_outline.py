@@ -1,5 +1,7 @@
 """Outlines: tangent planes by hand, derivatives, and edges found in rendered images."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from cylinder_scene import Cylinder, Scene, brick_texture, camera_model, noise_texture, pick_on, random_case, render
@@ -8,9 +10,11 @@ from hypothesis import strategies as st
 
 from surecut.factors.measurements import OutlineSighting, Rejection
 from surecut.factors.outline import outline_lines, outline_noise, outline_residual, plane_normal
-from surecut.frontends.pipe.limb import EdgeSeed, confirmed_edges, fit_edges
+from surecut.frontends.pipe.limb import EdgeSeed, Window, confirmed_edges, fit_edges
+from surecut.frontends.pipe.limb_model import EdgePixels, EdgeStates, linearised
+from surecut.frontends.pipe.pairs import OutlinePrior
 from surecut.frontends.pipe.predict import predict_outline
-from surecut.frontends.pipe.silhouette import OutlineFinder, silhouette_sighting
+from surecut.frontends.pipe.silhouette import OutlineFinder, OutlineView, find_outlines, silhouette_sighting
 from surecut.frontends.rays import pixel_rays
 
 CAMERA = camera_model()
@@ -81,10 +85,10 @@ def test_edge_fit_is_unbiased_with_an_honest_sigma(light):
             foot = foot - (line[:2] @ foot + line[2]) * line[:2]
             seed_line = line + np.array([0, 0, rng.normal(0, 0.4)])
             seed = EdgeSeed(seed_line, foot, (-50, 50), 13.5 / z)
-            pixels = image.ravel().astype(float), ideal.reshape(-1, 2)
-            (found,) = fit_edges(*pixels, [seed], 1.5)
+            looked = [(Window(image.ravel().astype(float), ideal.reshape(-1, 2), 1.5), seed)]
+            (found,) = fit_edges(looked)
             assert found is not None
-            (fit,) = confirmed_edges(*pixels, [seed], [found], 1.5)
+            (fit,) = confirmed_edges(looked, [found])
             assert fit is not None
             turn = np.arctan2(line[0] * fit.line[1] - line[1] * fit.line[0], line[:2] @ fit.line[:2])
             error = np.array([line[:2] @ fit.foot_px + line[2], turn])
@@ -118,6 +122,46 @@ def test_finds_the_outline_about_a_pick_and_says_why_not():
     assert blank.reason
     outside = silhouette_sighting(image, CAMERA, np.array([-500.0, 50.0]))
     assert isinstance(outside, Rejection)
+
+
+def test_pictures_looked_at_together_answer_as_each_alone():
+    finder, views = OutlineFinder(CAMERA), []
+    for seed, z in ((4, 1.1), (5, 1.2), (6, 1.35)):
+        rng = np.random.default_rng(seed)
+        pipe = Cylinder([0.05, 0, z], [0.15, 1, 0.05], 0.05, 0.85)
+        scene = Scene([pipe], texture=noise_texture(rng), wall_m=2.2, light=(-0.2, -0.5, -0.8), ambient=0.5, noise=1.5)
+        pick, _ = pick_on(scene, CAMERA, rng, 1.0)
+        prior = OutlinePrior(pick, 1.5, 0.05 * CAMERA.fx / z, 1.0)
+        views.append(OutlineView(finder, seed, "pipe0", render(scene, CAMERA, rng), prior))
+    blank = OutlineView(finder, 7, "pipe0", np.full_like(views[0].image, 90), views[0].prior)
+    together = find_outlines([views[0], blank, *views[1:]])
+    assert isinstance(together.pop(1), Rejection)
+    for view, found in zip(views, together, strict=True):
+        alone = finder.find(view.stamp_ns, view.pipe_id, view.image, view.prior)
+        assert isinstance(found, OutlineSighting)
+        assert isinstance(alone, OutlineSighting)
+        sigma = np.sqrt(alone.covariance[:, 0, 0])
+        for i in range(2):
+            assert abs(np.append(alone.foot_px[i], 1.0) @ found.lines[i]) < 0.02 * sigma[i]
+        assert found.quality == pytest.approx(alone.quality, abs=1e-3)
+
+
+def test_edge_model_in_single_precision_follows_the_one_in_double():
+    rng = np.random.default_rng(2)
+    depth, along = rng.uniform(-4.5, 5.0, (12, 40)), rng.uniform(-30, 30, (12, 40))
+    edge, each = np.repeat((0, 1), 6), np.ones(12)
+    grey = 90.0 + 60.0 * (depth > 0.3) + 5.0 * np.sqrt(np.maximum(depth, 0)) + rng.normal(0, 1.5, depth.shape)
+    double = EdgePixels(grey, depth, along, np.ones_like(grey), 12.0 * each, 0.3 * each, edge, 1.5 * each)
+    single = replace(double, **{n: getattr(double, n).astype(np.float32) for n in ("grey", "depth", "along", "weight")})
+    state = EdgeStates.start(2).moved(np.tile([0.3, 0.002, -0.1, 20.0, 3.0, 30.0, -8.0, 4.0, 2.0], (2, 1)))
+    exact, fast = linearised(double, state), linearised(single, state)
+    assert np.allclose(fast.shift, exact.shift, atol=2e-4)
+    assert np.allclose(fast.variance, exact.variance, rtol=1e-3)
+    step = 1e-4
+    for i in range(2):
+        ahead, back = (state.moved(np.eye(9)[[i, i]] * s) for s in (step, -step))
+        slope = (linearised(double, ahead).squares - linearised(double, back).squares) / (4 * step)
+        assert np.allclose(slope, -exact.score[:, i], rtol=0.02, atol=0.02 * np.abs(slope).max())
 
 
 def test_outline_in_a_distorted_image():

@@ -18,6 +18,10 @@ _SMALL_PX = 45.0
 _UPSAMPLED_AREA = 700_000
 """Largest area of an image, in pixels, that is upsampled at every look."""
 _MIN_SIDE_PX = 8.0
+_UPSAMPLED_WINDOW_PX = 13
+"""Smallest window of the adaptive threshold in an upsampled image. OpenCV's smallest, 3 px, is half a cell of the
+smallest marker there: it shows noise, costs a third of the search, and read none of 383 markers in 945 rendered images
+that this one did not read with the same corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,4 +117,6 @@ def _parameters(longest: int, scale: int) -> cv2.aruco.DetectorParameters:
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
     parameters.minMarkerPerimeterRate = min(0.5, 4 * _MIN_SIDE_PX * scale / longest)
     parameters.minDistanceToBorder = 1
+    if scale > 1:
+        parameters.adaptiveThreshWinSizeMin = _UPSAMPLED_WINDOW_PX
     return parameters

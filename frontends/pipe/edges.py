@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..median import median
-
 Float = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
@@ -72,12 +70,13 @@ def straight_lines(
     near[:, :, :-1] |= peak[:, :, 1:]
     score, first, last = _spans(near, valid)
     seeds = _maxima(score, count, closed=angles is None)
-    lines: list[EdgeLine] = []
-    for i, j in seeds:
-        line = _refined(theta[i], j - reach, peak[i], size[i], first[i, j], last[i, j], reach, float(score[i, j]))
-        if line is not None and abs(line.rho) <= widest_px and all(not _same(line, other) for other in lines):
-            lines.append(line)
-    return lines
+    if not len(seeds):
+        return []
+    i, j = seeds.T
+    rows = np.arange(_STRETCHES)
+    places = _places(peak[i], size[i], j, (rows >= first[i, j, None]) & (rows <= last[i, j, None]))
+    lines = _refined(theta[i], places - reach, score[i, j])
+    return _distinct([line for line in lines if line is not None and abs(line.rho) <= widest_px])
 
 
 def _directions(angles: tuple[float, float] | None) -> Float:
@@ -119,69 +118,94 @@ def _spans(near: NDArray[np.bool_], valid: NDArray[np.bool_]) -> tuple[Float, ND
     return best, half - 1 - first, half + last
 
 
-def _maxima(score: Float, count: int, closed: bool) -> list[tuple[int, int]]:
-    """Local maxima over direction and distance; directions close up with the distance mirrored."""
+def _maxima(score: Float, count: int, closed: bool) -> NDArray[np.int64]:
+    """Local maxima over direction and distance, (n, 2); directions close up with the distance mirrored."""
     table = score.astype(np.float32)
     top = np.vstack((table[-2:, ::-1], table, table[:2, ::-1])) if closed else np.pad(table, ((2, 2), (0, 0)))
     peak = (table >= cv2.dilate(top, np.ones((5, 3), np.uint8))[2:-2]) & (table > 2.5)
     rows, columns = np.nonzero(peak)
     best = np.argsort(-table[rows, columns])[:count]
-    return [(int(rows[i]), int(columns[i])) for i in best]
+    return np.column_stack((rows[best], columns[best]))
 
 
-def _refined(
-    theta: float,
-    distance: int,
-    peak: NDArray[np.bool_],
-    size: Float,
-    first: int,
-    last: int,
-    reach: int,
-    evidence: float,
-) -> EdgeLine | None:
-    """Line through the sub-pixel maxima of the stretches of one seed."""
-    rows = np.arange(first, last + 1)
-    column = distance + reach
-    places = []
-    for row in rows:
-        for c in (column, column - 1, column + 1):
-            if 0 < c < peak.shape[1] - 1 and peak[row, c]:
-                left, middle, right = size[row, c - 1 : c + 2]
-                bend = left - 2 * middle + right
-                places.append((row, c - reach + (0.5 * (left - right) / bend if bend < 0 else 0.0)))
-                break
-    if len(places) < 2:
-        return None
-    row, where = np.array(places).T
-    along = (row + 0.5) * _STRETCH - _HALF_LENGTH
-    slope, shift = _straight(along, where)
+def _places(peak: NDArray[np.bool_], size: Float32, column: NDArray[np.int64], used: NDArray[np.bool_]) -> Float:
+    """Sub-pixel column of the maximum of each stretch about a seed's column, shape (seeds, stretches); NaN for none.
+
+    Args:
+        peak: (seeds, stretches, columns), where the maxima are.
+        size: Likewise, what is greatest there.
+        column: (seeds,)
+        used: (seeds, stretches), which stretches to look at.
+    """
+    seed, row = np.arange(len(column))[:, None], np.arange(used.shape[1])
+    inner = peak.shape[2] - 2
+    places = np.full(used.shape, np.nan)
+    for aside in (1, -1, 0):  # the seed's own column last: it is preferred
+        at = column[:, None] + aside
+        inside = np.clip(at, 1, inner)
+        here = used & (at == inside) & peak[seed, row, inside]
+        left, middle, right = (size[seed, row, inside + k].astype(float) for k in (-1, 0, 1))
+        bend = left - 2 * middle + right
+        curved = bend < 0
+        places = np.where(here, at + np.where(curved, 0.5 * (left - right) / np.where(curved, bend, 1.0), 0.0), places)
+    return places
+
+
+def _refined(theta: Float, places: Float, evidence: Float) -> list[EdgeLine | None]:
+    """Lines through the sub-pixel maxima of the stretches of each seed, (seeds, stretches); None with fewer than 2."""
+    there = np.isfinite(places)
+    count = there.sum(axis=1)
+    where = np.where(there, places, 0.0)
+    along = (np.arange(places.shape[1]) + 0.5) * _STRETCH - _HALF_LENGTH
+    slope, shift = _straight(along, where, there)
     for _ in range(2):
-        off = np.abs(where - slope * along - shift)
-        keep = off <= max(2.5 * median(off), 0.4)
-        if keep.sum() >= 2:
-            slope, shift = _straight(along[keep], where[keep])
-    turn = float(np.arctan(slope))
+        off = np.abs(where - slope[:, None] * along - shift[:, None])
+        keep = there & (off <= np.maximum(2.5 * _medians(off, there, count), 0.4)[:, None])
+        again = keep.sum(axis=1) >= 2
+        slope, shift = np.where(again, _straight(along, where, keep | ~again[:, None]), (slope, shift))
+    turn = np.arctan(slope)
     # x = shift + slope s: the normal turns by -turn (along is (-sin, cos)).
-    angle, rho = theta - turn, float(shift * np.cos(turn))
-    move = float(shift * np.sin(turn))
-    start, end = row.min() * _STRETCH - _HALF_LENGTH, (row.max() + 1) * _STRETCH - _HALF_LENGTH
-    wraps = int(np.floor(angle / np.pi))
-    sign = 1 if wraps % 2 == 0 else -1
-    span = (float(start + move), float(end + move))
-    return EdgeLine(angle - wraps * np.pi, sign * rho, span if sign > 0 else (-span[1], -span[0]), evidence)
+    angle, rho, move = theta - turn, shift * np.cos(turn), shift * np.sin(turn)
+    start = there.argmax(axis=1) * _STRETCH - _HALF_LENGTH + move
+    end = (places.shape[1] - there[:, ::-1].argmax(axis=1)) * _STRETCH - _HALF_LENGTH + move
+    wraps = np.floor(angle / np.pi)
+    back = wraps % 2 != 0
+    angle, rho = angle - wraps * np.pi, np.where(back, -rho, rho)
+    start, end = np.where(back, -end, start), np.where(back, -start, end)
+    tables = zip(angle.tolist(), rho.tolist(), start.tolist(), end.tolist(), evidence.tolist(), count, strict=True)
+    return [EdgeLine(a, r, (s, e), float(v)) if c > 1 else None for a, r, s, e, v, c in tables]
 
 
-def _straight(x: Float, y: Float) -> tuple[float, float]:
-    """Slope and offset of the least squares line."""
-    middle = x.mean()
-    slope = float((x - middle) @ y / ((x - middle) @ (x - middle)))
-    return slope, float(y.mean() - slope * middle)
+def _straight(x: Float, y: Float, used: NDArray[np.bool_]) -> tuple[Float, Float]:
+    """Slopes and offsets of least squares lines, (lines,), through places x (n,) and y (lines, n)."""
+    count = np.maximum(used.sum(axis=1), 1)
+    middle, height = (used @ x) / count, (used * y).sum(axis=1) / count
+    off = (x - middle[:, None]) * used
+    slope = (off * y).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-12)
+    return slope, height - slope * middle
 
 
-def _same(a: EdgeLine, b: EdgeLine) -> bool:
-    turn = np.mod(a.angle - b.angle + np.pi / 2, np.pi) - np.pi / 2
-    rho = b.rho if abs(a.angle - b.angle) < np.pi / 2 else -b.rho
-    return bool(abs(turn) < np.deg2rad(1.5) and abs(a.rho - rho) < 0.8)
+def _medians(values: Float, used: NDArray[np.bool_], count: NDArray[np.int64]) -> Float:
+    """Of the values of each row that are used, (rows,); infinite where there are none."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=1)
+    row = np.arange(len(count))
+    return 0.5 * (ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, count // 2])
+
+
+def _distinct(lines: list[EdgeLine]) -> list[EdgeLine]:
+    """Without those that are the same as one before."""
+    if not lines:
+        return []
+    angle, rho = np.array([(line.angle, line.rho) for line in lines]).T
+    between = angle[:, None] - angle
+    turn = np.mod(between + np.pi / 2, np.pi) - np.pi / 2
+    other = np.where(np.abs(between) < np.pi / 2, rho, -rho)
+    same = (np.abs(turn) < np.deg2rad(1.5)) & (np.abs(rho[:, None] - other) < 0.8)
+    kept: list[int] = []
+    for i in range(len(lines)):
+        if not same[i, kept].any():
+            kept.append(i)
+    return [lines[i] for i in kept]
 
 
 def image_noise(patch: Float32) -> float:

@@ -8,19 +8,15 @@ from numpy.typing import NDArray
 
 from ..covariance import larger
 from ..median import median
-from .limb_model import SHADING_TERMS, EdgeModel, EdgePixels, EdgeStates, linearised
+from .limb_fit import LAST_STAGE, Stretches, converged, information, stretch_weights
+from .limb_model import EdgeModel, EdgePixels, EdgeStates, linearised
 
 Float = NDArray[np.float64]
+Real = NDArray[np.floating]
 
 _STRETCH_PX = 5.0
-_ITERATIONS, _STAGE = 16, 4
-"""Steps altogether, and of each early stage."""
-_FARTHEST_PX = 2.6
-"""The fit may move the line so far: shading inside can be steeper than the edge that a seed is taken for."""
 _WIDE, _NARROW = (4.5, 5.0), (3.0, 2.5)
 """How far outside and inside the edge a fit looks, px."""
-_SHADING_RANGE = 80.0
-"""Prior sigma of a shading term, grey values over half the pipe's width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,58 +56,78 @@ class EdgeSeed:
     """Half the pipe's width in the image."""
 
 
-def fit_edges(grey: Float, px: Float, seeds: Sequence[EdgeSeed], noise: float) -> list[EdgeFit | None]:
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The pixels about a place of an image."""
+
+    grey: Real
+    """(n,)"""
+    px: Float
+    """(n, 2), ideal."""
+    noise: float
+    """White noise of the image, grey values."""
+
+
+Looked = Sequence[tuple[Window, EdgeSeed]]
+"""Edges, and the pixels that each is looked for in."""
+
+
+def fit_edges(looked: Looked) -> list[EdgeFit | None]:
     """Fits occluding edges, each near its seed; all of them at once, because one alone is too little work for NumPy.
 
-    Args:
-        grey: Shape (n,), grey values of the pixels around the edges.
-        px: Shape (n, 2), their ideal pixels.
-        seeds: Where to look.
-        noise: White noise of the image, grey values.
-
     Returns:
-        Per seed; None where the grey values do not hold such an edge. What is to be used as a measurement wants
+        Per edge; None where the grey values do not hold such an edge. What is to be used as a measurement wants
         `confirmed_edges` as well.
     """
-    found = _fitted(grey, px, seeds, noise, _WIDE)
-    return [None if one is None else _result(seed, *one) for seed, one in zip(seeds, found, strict=True)]
+    found = _fitted(looked, _WIDE)
+    return [None if one is None else _result(seed, one) for (_, seed), one in zip(looked, found, strict=True)]
 
 
-def confirmed_edges(
-    grey: Float, px: Float, seeds: Sequence[EdgeSeed], fits: Sequence[EdgeFit], noise: float
-) -> list[EdgeFit | None]:
+def confirmed_edges(looked: Looked, fits: Sequence[EdgeFit]) -> list[EdgeFit | None]:
     """The same edges fitted in a narrower window: what the two do not agree on is the model's error, not noise.
 
     Returns:
         The given fits with a covariance that holds the disagreement; None where the narrow window finds no edge.
     """
-    found = _fitted(grey, px, seeds, noise, _NARROW)  # from the seeds again: who ends elsewhere is unsure
+    found = _fitted(looked, _NARROW)  # from the seeds again: who ends elsewhere is unsure
     return [
-        None if one is None else replace(fit, covariance=fit.covariance + _disagreement(seed, fit, one[1]))
-        for seed, fit, one in zip(seeds, fits, found, strict=True)
+        None if one is None else replace(fit, covariance=fit.covariance + _disagreement(seed, fit, one.state))
+        for (_, seed), fit, one in zip(looked, fits, found, strict=True)
     ]
 
 
-def _fitted(
-    grey: Float, px: Float, seeds: Sequence[EdgeSeed], noise: float, window: tuple[float, float]
-) -> list[tuple[EdgePixels, EdgeStates] | None]:
-    """Pixels and converged state of every edge."""
-    noise = max(noise, 0.3)
-    gathered = [_gather(grey, px, seed, noise, window) for seed in seeds]
+@dataclass(frozen=True, slots=True)
+class _Converged:
+    """One edge at the end of a fit."""
+
+    pixels: EdgePixels
+    state: EdgeStates
+    linear: EdgeModel
+    weights: Float
+    """(stretches,)"""
+
+
+def _fitted(looked: Looked, reach_px: tuple[float, float]) -> list[_Converged | None]:
+    """Every edge where its fit converges, by the pixels so far outside and inside."""
+    gathered = [_gather(window, seed, reach_px) for window, seed in looked]
     parts = [table for table in gathered if table is not None]
     if not parts:
-        return [None] * len(seeds)
-    pixels = _joined(parts, noise)
-    state, good = _converged(pixels)
+        return [None] * len(looked)
+    pixels = _joined(parts)
+    state, good = converged(pixels)
+    pixels = pixels.double()
+    linear = linearised(pixels, state)
+    weights = stretch_weights(Stretches.of(pixels.edge), linear)
     number = iter(range(len(parts)))
-    found: list[tuple[EdgePixels, EdgeStates] | None] = []
+    found: list[_Converged | None] = []
     for table in gathered:
         this = None if table is None else next(number)
         if this is None or not good[this]:
             found.append(None)
         else:
             one = np.arange(len(good)) == this
-            found.append((pixels.only(one), state.only(one)))
+            rows = one[pixels.edge]
+            found.append(_Converged(pixels.only(one), state.only(one), linear.only(rows), weights[rows]))
     return found
 
 
@@ -122,48 +138,17 @@ def _disagreement(seed: EdgeSeed, fit: EdgeFit, other: EdgeStates) -> Float:
     return np.diag([(offset - float(other.offset[0])) ** 2, (turn - float(other.turn[0])) ** 2])
 
 
-def _converged(pixels: EdgePixels) -> tuple[EdgeStates, NDArray[np.bool_]]:
-    """Levenberg-Marquardt in three stages (see `_prior`), and which edges did not run away."""
-    edges = int(pixels.edge[-1]) + 1
-    state = EdgeStates.start(edges)
-    good, moving = np.ones(edges, bool), np.ones(edges, bool)
-    linear, weights, damping = linearised(pixels, state), np.ones(len(pixels.grey)), np.full(edges, 1e-3)
-    for iteration in range(_ITERATIONS):
-        prior = _prior(iteration // _STAGE)
-        normal, scores = _normal(pixels, linear, weights, prior)
-        gradient = pixels.summed(scores) - prior * state.deviation()
-        damped = normal + damping[:, None, None] * (np.eye(normal.shape[1]) * normal)
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial = state.moved(step)
-        good &= ~(moving & ((np.abs(trial.offset) > _FARTHEST_PX) | (np.abs(trial.turn) > 0.12)))
-        moving &= good
-        if not moving.any():
-            break
-        proposal = linear.renewed(pixels, trial, moving)
-        gain = pixels.summed(weights / linear.variance * (linear.squares - proposal.squares))
-        gain += (state.deviation() ** 2 - trial.deviation() ** 2) @ prior
-        better = moving & (gain >= 0)
-        damping = np.where(better, np.maximum(damping / 5.0, 1e-4), damping * 10.0)
-        state = trial.where(better, state)
-        taken = better[pixels.edge]
-        linear = proposal.where(taken, linear)
-        weights = np.where(taken, _weights(pixels, linear), weights)
-        good &= ~(better & (pixels.summed(weights) < 1.5))
-        moving &= good
-        if iteration > 2 * _STAGE:
-            moving &= ~((np.abs(step[:, 0]) < 5e-3) & (np.abs(step[:, 1]) < 2e-4))
-    return state, good
-
-
-def _gather(grey: Float, px: Float, seed: EdgeSeed, noise: float, window: tuple[float, float]) -> EdgePixels | None:
+def _gather(window: Window, seed: EdgeSeed, reach_px: tuple[float, float]) -> EdgePixels | None:
     """The pixels on both sides of a seed, by stretch."""
+    grey, px, noise = window.grey, window.px, max(window.noise, 0.3)
     line, span = seed.line, seed.span
-    outside, deepest = window
+    outside, deepest = reach_px
     inside = float(np.clip(0.8 * seed.half_width_px, 2.0, deepest)) + 0.5
     depth = -(px @ line[:2] + line[2])
-    along = (px - seed.foot_px) @ np.array([-line[1], line[0]])
-    keep = (depth > -outside) & (depth < inside) & (along >= span[0]) & (along < span[1]) & np.isfinite(grey + depth)
-    grey, depth, along = grey[keep], depth[keep], along[keep]
+    near = np.flatnonzero((depth > -outside) & (depth < inside))
+    along = (px[near] - seed.foot_px) @ np.array([-line[1], line[0]])
+    keep = (along >= span[0]) & (along < span[1]) & np.isfinite(grey[near])
+    grey, depth, along = grey[near[keep]], depth[near[keep]], along[keep]
     number = max(1, round((span[1] - span[0]) / _STRETCH_PX))
     stretch = np.minimum(((along - span[0]) / (span[1] - span[0]) * number).astype(int), number - 1)
     count = np.bincount(stretch, minlength=number)
@@ -172,37 +157,32 @@ def _gather(grey: Float, px: Float, seed: EdgeSeed, noise: float, window: tuple[
         return None
     order = np.argsort(stretch, kind="stable")
     place = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
-    table = np.zeros((4, number, count.max()))
+    table = np.zeros((4, number, count.max()), np.float32)
     for i, values in enumerate((grey, depth, along, np.ones(len(grey)))):
         table[i, stretch[order], place] = values[order]
     values, depths, places, weight = table[:, full]
     evenness = noise / _stains(values, depths, places, weight, inside)
-    same = np.ones(len(values))
-    return EdgePixels(
-        values, depths, places, weight, seed.half_width_px * same, evenness * same, same.astype(np.int64) * 0, noise
-    )
+    half_width, evenness, noises = (np.full(len(values), v) for v in (seed.half_width_px, evenness, noise))
+    return EdgePixels(values, depths, places, weight, half_width, evenness, np.zeros(len(values), np.int64), noises)
 
 
-def _joined(parts: list[EdgePixels], noise: float) -> EdgePixels:
+def _joined(parts: list[EdgePixels]) -> EdgePixels:
     """Several edges in one table."""
-    width = max(part.grey.shape[1] for part in parts)
-
-    def padded(tables: list[Float]) -> Float:
-        return np.concatenate([np.pad(t, ((0, 0), (0, width - t.shape[1]))) for t in tables])
-
-    return EdgePixels(
-        padded([p.grey for p in parts]),
-        padded([p.depth for p in parts]),
-        padded([p.along for p in parts]),
-        padded([p.weight for p in parts]),
-        np.concatenate([p.half_width for p in parts]),
-        np.concatenate([p.evenness for p in parts]),
-        np.repeat(np.arange(len(parts)), [len(p.edge) for p in parts]),
-        noise,
+    count = [len(part.edge) for part in parts]
+    ends = np.cumsum(count)
+    table = np.zeros((4, ends[-1], max(part.grey.shape[1] for part in parts)), np.float32)
+    for part, end in zip(parts, ends, strict=True):
+        stretches, n = part.grey.shape
+        table[:, end - stretches : end, :n] = part.grey, part.depth, part.along, part.weight
+    half_width, evenness, noise = (
+        np.concatenate(t) for t in zip(*((p.half_width, p.evenness, p.noise) for p in parts), strict=True)
     )
+    grey, depth, along, weight = table
+    edge = np.repeat(np.arange(len(parts)), count)
+    return EdgePixels(grey, depth, along, weight, half_width, evenness, edge, noise)
 
 
-def _stains(grey: Float, depth: Float, along: Float, weight: Float, inside: float) -> float:
+def _stains(grey: Real, depth: Real, along: Real, weight: Real, inside: float) -> float:
     """How much the pipe's grey value varies along it beyond a trend, well inside the edge; at least half a level."""
     deep = weight * (depth > min(2.2, inside - 1.5))
     count = deep.sum(axis=1)
@@ -214,55 +194,21 @@ def _stains(grey: Float, depth: Float, along: Float, weight: Float, inside: floa
     return max(1.4826 * median(np.abs(left)), 0.5)
 
 
-def _weights(pixels: EdgePixels, linear: EdgeModel) -> Float:
-    """Tukey weights of the stretches by where each alone would put their edge."""
-    edge, starts, shift = pixels.edge, pixels.starts, linear.shift
-    order = np.lexsort((shift, edge))
-    information = np.cumsum(1 / linear.shift_sigma[order] ** 2)
-    ends = np.append(starts[1:], len(edge)) - 1
-    before = np.where(starts > 0, information[starts - 1], 0.0)
-    halfway = np.searchsorted(information, 0.5 * (before + information[ends]))
-    middle = shift[order][np.clip(halfway, starts, ends)][edge]
-    off = np.abs(shift - middle)
-    ranked = off[np.lexsort((off, edge))]
-    typical = 1.4826 * 0.5 * (ranked[(starts + ends) // 2] + ranked[(starts + ends + 1) // 2])
-    typical = np.where(ends - starts > 2, typical, 0.0)[edge]
-    scale = np.sqrt(linear.shift_sigma**2 + np.clip(typical, 0.08, 0.5) ** 2)
-    ratio = (shift - middle) / (4.0 * scale)
-    return np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
-
-
-def _normal(pixels: EdgePixels, linear: EdgeModel, weights: Float, prior: Float) -> tuple[Float, Float]:
-    """Normal equations per edge, (edges, k, k), and scores per stretch, (stretches, k)."""
-    scaled = weights / linear.variance
-    return pixels.summed(scaled[:, None, None] * linear.normal) + np.diag(prior), scaled[:, None] * linear.score
-
-
-def _prior(stage: int) -> Float:
-    """Information of the weak priors; early stages hold blur and kinks, so that the step is found before its finish."""
-    shading = np.full(SHADING_TERMS, _SHADING_RANGE**-2.0)
-    shading[0] = 1e-6
-    if stage < 2:
-        shading[3:] = 1e6
-    return np.concatenate(((1e-9, 1e-9, 1.0 if stage >= 1 else 1e6), shading))
-
-
-def _covariance(pixels: EdgePixels, linear: EdgeModel, weights: Float) -> Float:
+def _covariance(one: _Converged) -> Float:
     """Of (offset, turn): texture behind the pipe correlates the residuals of one stretch, so each stretch counts as one
     observation (cluster-robust sandwich), and no less than what independent pixels would give."""
-    normal, scores = _normal(pixels, linear, weights, _prior(2))
-    inverse = np.linalg.inv(normal[0])
+    scaled, weights = one.weights / one.linear.variance, one.weights
+    scores = scaled[:, None] * one.linear.score
+    inverse = np.linalg.inv(np.tensordot(scaled, one.linear.normal, 1) + np.diag(information(LAST_STAGE)))
     effective = weights.sum() ** 2 / (weights**2).sum()
     sandwich = inverse @ (scores.T @ scores) @ inverse * effective / max(effective - 2.0, 0.5)
     return larger(np.asarray(inverse[:2, :2], np.float64), sandwich[:2, :2])
 
 
-def _result(seed: EdgeSeed, pixels: EdgePixels, state: EdgeStates) -> EdgeFit | None:
+def _result(seed: EdgeSeed, one: _Converged) -> EdgeFit | None:
     """One edge's fit."""
-    line, foot_px = seed.line, seed.foot_px
-    linear = linearised(pixels, state)
-    weights = _weights(pixels, linear)
-    good = (linear.shift_sigma < 0.5) & (weights > 0.1)
+    line, foot_px, pixels, state = seed.line, seed.foot_px, one.pixels, one.state
+    good = (one.linear.shift_sigma < 0.5) & (one.weights > 0.1)
     if good.sum() < 2:
         return None
     offset, turn = float(state.offset[0]), float(state.turn[0])
@@ -276,13 +222,13 @@ def _result(seed: EdgeSeed, pixels: EdgePixels, state: EdgeStates) -> EdgeFit | 
     return EdgeFit(
         line=np.array([normal[0], normal[1], -normal @ foot]),
         foot_px=foot,
-        covariance=_covariance(pixels, linear, weights),
+        covariance=_covariance(one),
         extent=(float(start), float(end)),
         blur_px=float(np.exp(state.log_blur[0])),
         contrast=contrast,
         sharpness=sharpness,
         supported=int(good.sum()),
-        stretches=len(weights),
+        stretches=len(one.weights),
     )
 
 

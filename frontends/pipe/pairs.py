@@ -59,67 +59,64 @@ class EdgePair:
     """Log-likelihood ratio that a pipe fills the space between, see `surface.region_score`."""
 
 
-def edge_pairs(lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limits: PairLimits) -> list[EdgePair]:
-    """All pairs with the prior's centre between them that a cylinder could show, best first."""
+def edge_pairs(
+    lines: list[EdgeLine], prior: OutlinePrior, focal_px: float, limits: PairLimits, most: int | None = None
+) -> list[EdgePair]:
+    """The pairs with the prior's centre between them that a cylinder could show, best first, at most so many."""
     if len(lines) < 2:
         return []
-    pairs = []
-    for i, first in enumerate(lines):
-        for second in lines[i + 1 :]:
-            pair = _pair(first, second, prior, focal_px, limits)
-            if pair is not None:
-                pairs.append(pair)
-    return sorted(pairs, key=lambda pair: -pair.score)
+    first, second = np.triu_indices(len(lines), 1)
+    angle, rho, evidence = np.array([(line.angle, line.rho, line.evidence) for line in lines]).T
+    turn, other = _aligned(angle[second] - angle[first], rho[second])
+    bisector = angle[first] + 0.5 * turn
+    sides = np.stack((rho[first], other)) / np.cos(0.5 * turn)
+    width, middle = np.abs(sides[1] - sides[0]), 0.5 * (sides[0] + sides[1])
+    possible = np.abs(turn) <= np.deg2rad(25.0)
+    possible &= (limits.thinnest_px <= width) & (width <= limits.widest_px)
+    possible &= np.abs(middle) <= np.minimum(4 * prior.middle_sigma_px, 0.45 * width)
+    possible &= np.abs(turn) <= width / (limits.nearest_vanishing_f * focal_px) + np.deg2rad(2.0)
+    surprise = _surprise(width, middle, bisector + 0.5 * np.pi, focal_px, prior)
+    score = 0.5 * (evidence[first] + evidence[second] - surprise)
+    best = np.flatnonzero(possible)
+    best = best[np.argsort(-score[best], kind="stable")][:most]
+    edges = _outlines(angle[first[best]], rho[first[best]], turn[best], other[best], prior.centre_px, middle[best])
+    return [
+        EdgePair(
+            lines[first[i]], lines[second[i]], both, float(np.mod(bisector[i] + 0.5 * np.pi, np.pi)),
+            float(width[i]), float(middle[i]), float(score[i]), float(surprise[i]),
+        )
+        for i, both in zip(best, edges, strict=True)
+    ]  # fmt: skip
 
 
-def _pair(
-    first: EdgeLine, second: EdgeLine, prior: OutlinePrior, focal_px: float, limits: PairLimits
-) -> EdgePair | None:
-    turn, rho = _aligned(first, second)
-    if abs(turn) > np.deg2rad(25.0):
-        return None
-    bisector = first.angle + 0.5 * turn
-    cosine = np.cos(0.5 * turn)
-    sides = np.array([first.rho, rho]) / cosine
-    width = abs(sides[1] - sides[0])
-    middle = 0.5 * (sides[0] + sides[1])
-    if not limits.thinnest_px <= width <= limits.widest_px or abs(middle) > 4 * prior.middle_sigma_px:
-        return None
-    if abs(middle) > 0.45 * width:
-        return None
-    if abs(turn) > width / (limits.nearest_vanishing_f * focal_px) + np.deg2rad(2.0):
-        return None
-    surprise = _surprise(float(width), float(middle), bisector + 0.5 * np.pi, focal_px, prior)
-    score = 0.5 * (first.evidence + second.evidence - surprise)
-    out = np.array([_line(first.angle, first.rho, prior.centre_px), _line(first.angle + turn, rho, prior.centre_px)])
-    centre = np.append(prior.centre_px + middle * np.array([np.cos(bisector), np.sin(bisector)]), 1.0)
-    out *= -np.sign(out @ centre)[:, None]
-    direction = float(np.mod(bisector + 0.5 * np.pi, np.pi))
-    return EdgePair(first, second, out, direction, float(width), float(middle), score, surprise)
+def _aligned(turn: Float, rho: Float) -> tuple[Float, Float]:
+    """Turns from one normal to another, within a right angle, and the other's rho with its normal turned alike."""
+    back, forth = turn > np.pi / 2, turn <= -np.pi / 2
+    return turn - np.pi * back + np.pi * forth, np.where(back | forth, -rho, rho)
 
 
-def _aligned(first: EdgeLine, second: EdgeLine) -> tuple[float, float]:
-    """Turn from the first normal to the second, and the second's rho with its normal turned the same way round."""
-    turn = second.angle - first.angle
-    if turn > np.pi / 2:
-        return turn - np.pi, -second.rho
-    if turn <= -np.pi / 2:
-        return turn + np.pi, -second.rho
-    return turn, second.rho
+def _outlines(angle: Float, rho: Float, turn: Float, other: Float, centre: Float, middle: Float) -> Float:
+    """Both lines of each pair, (pairs, 2, 3), positive outside."""
+    out = np.stack((_lines(angle, rho, centre), _lines(angle + turn, other, centre)), axis=1)
+    bisector = angle + 0.5 * turn
+    between = centre + middle[:, None] * np.column_stack((np.cos(bisector), np.sin(bisector)))
+    inside = np.einsum("pij,pj->pi", out, np.column_stack((between, np.ones(len(between)))))
+    return out * -np.sign(inside)[..., None]
 
 
-def _line(angle: float, rho: float, centre: Float) -> Float:
-    normal = np.array([np.cos(angle), np.sin(angle)])
-    return np.array([normal[0], normal[1], -normal @ centre - rho])
+def _lines(angle: Float, rho: Float, centre: Float) -> Float:
+    normal = np.column_stack((np.cos(angle), np.sin(angle)))
+    return np.column_stack((normal, -normal @ centre - rho))
 
 
-def _surprise(width: float, middle: float, direction: float, focal_px: float, prior: OutlinePrior) -> float:
+def _surprise(width: Float, middle: Float, direction: Float, focal_px: float, prior: OutlinePrior) -> Float:
     chi2 = (middle / prior.middle_sigma_px) ** 2
     if prior.half_width_px is None:
-        chi2 += ((np.log(width / focal_px) - _USUAL_WIDTH[0]) / _USUAL_WIDTH[1]) ** 2
+        wide = np.log(np.maximum(width, 1e-9) / focal_px)
+        chi2 += ((wide - _USUAL_WIDTH[0]) / _USUAL_WIDTH[1]) ** 2
     else:
         chi2 += ((0.5 * width - prior.half_width_px) / prior.half_width_sigma_px) ** 2
     if prior.direction_rad is not None:
         turn = np.mod(direction - prior.direction_rad + np.pi / 2, np.pi) - np.pi / 2
         chi2 += (turn / prior.direction_sigma_rad) ** 2
-    return float(chi2)
+    return chi2

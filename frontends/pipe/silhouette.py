@@ -1,6 +1,6 @@
 """The outline of a pipe in one image: two occluding edges near a pick, or near where the pipe is expected."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,9 +11,10 @@ from ...factors.measurements import CameraName, OutlineSighting, Rejection
 from ..rays import ideal_grid
 from ..undistort import distort, undistort
 from .edges import EdgeLine, image_noise, straight_lines
-from .limb import EdgeFit, EdgeSeed, confirmed_edges, fit_edges
+from .hypotheses import Begun, Found, confirmed, outermost, refined, same_place, seen_sides
+from .limb import EdgeFit, Window
 from .pairs import EdgePair, OutlinePrior, PairLimits, edge_pairs
-from .surface import occlusion_score, region_edges, region_score, sampled
+from .surface import MOST_BY_REGION, region_edges, region_scores, sampled
 
 Float = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -43,32 +44,20 @@ class OutlineConfig:
     """See `limb.EdgeFit.sharpness`."""
 
 
-_NO_FIT = 3.0
-_NEAR_FITTED_PX, _NEAR_SEEDS_PX = 0.5, 1.6
 _REGIONS = 30
 """Hypotheses whose inside is looked at."""
+_REGIONS_AT_ONCE = 8
 
 
 @dataclass(frozen=True, slots=True)
-class _Found:
-    """A hypothesis with its sub-pixel edges."""
+class OutlineView:
+    """A picture in which an outline is to be looked for."""
 
-    pair: EdgePair
-    fits: tuple[EdgeFit, EdgeFit] | None
-    """None where the sub-pixel fit failed; the hypothesis stays, as what might have been."""
-    seeds: tuple[EdgeSeed, EdgeSeed]
-    score: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Window:
-    """The pixels about a place."""
-
-    grey: Float
-    """(n,)"""
-    px: Float
-    """(n, 2), ideal."""
-    noise: float
+    finder: "OutlineFinder"
+    stamp_ns: int
+    pipe_id: str
+    image: Grey
+    prior: OutlinePrior
 
 
 class OutlineFinder:
@@ -101,27 +90,26 @@ class OutlineFinder:
 
     def find(self, stamp_ns: int, pipe_id: str, image: Grey, prior: OutlinePrior) -> OutlineSighting | Rejection:
         """The outline that a prior describes, or why there is none."""
-        config = self._config
+        return find_outlines([OutlineView(self, stamp_ns, pipe_id, image, prior)])[0]
+
+    def begin(self, view: OutlineView) -> Begun | Rejection:
+        """The hypotheses of one picture, or why there are none."""
+        config, prior, image = self._config, view.prior, view.image
         rows, columns = self._window(prior.centre_px)
         if rows.stop - rows.start < 12 or columns.stop - columns.start < 12:
-            return self._refuse(
-                stamp_ns, pipe_id, "place of the pipe is outside the image, px from its border", 0.0, 6.0
-            )
+            return self._refuse(view, "place of the pipe is outside the image, px from its border", 0.0, 6.0)
         grey = image[rows, columns].astype(np.float32)
         noise = image_noise(grey)
         patch, centre = self._ideal_patch(image, prior.centre_px)
+        origin = prior.centre_px - centre
         lines = straight_lines(patch, centre, noise, self._widest(prior), self._angles(prior))
         lines += self._textured(patch, centre, lines, prior)
-        pairs = edge_pairs(lines, prior, self._camera.fx, config.limits)
-        pairs = [self._filled(pair, patch, prior.centre_px - centre, prior.centre_px) for pair in pairs[:_REGIONS]]
-        pairs.sort(key=lambda pair: -pair.score)
+        pairs = edge_pairs(lines, prior, self._camera.fx, config.limits, _REGIONS)
+        pairs = self._filled(pairs, patch, origin, prior)
         if not pairs:
-            return self._refuse(stamp_ns, pipe_id, "pairs of straight edges about the pick", 0.0, 1.0)
-        window = _Window(grey.astype(float).ravel(), self._ideal[rows, columns].reshape(-1, 2), noise)
-        found = self._refined(pairs, window, prior)
-        found = [self._seen(hypothesis, patch, prior.centre_px - centre) for hypothesis in found]
-        found = _confirmed(_outermost(sorted(found, key=lambda f: -f.score)), window)
-        return self._decide(stamp_ns, pipe_id, found, prior)
+            return self._refuse(view, "pairs of straight edges about the pick", 0.0, 1.0)
+        window = Window(grey.astype(float).ravel(), self._ideal[rows, columns].reshape(-1, 2), noise)
+        return Begun(prior, pairs, window, patch, origin)
 
     def _window(self, centre: Float) -> tuple[slice, slice]:
         reach = self._config.reach_px
@@ -153,30 +141,6 @@ class OutlineFinder:
             return None
         return prior.direction_rad + np.pi / 2, 3 * prior.direction_sigma_rad + np.deg2rad(6.0)
 
-    def _refined(self, pairs: list[EdgePair], window: _Window, prior: OutlinePrior) -> list[_Found]:
-        known = prior.half_width_px is not None
-        pairs = pairs[: self._config.refined_known if known else self._config.refined_pairs]
-        seeds: dict[tuple[int, bool], EdgeSeed] = {}
-        keys = []
-        for pair in pairs:
-            for line, edge in zip(pair.lines, (pair.first, pair.second), strict=True):
-                key = (id(edge), bool(line[:2] @ (np.cos(edge.angle), np.sin(edge.angle)) > 0))
-                keys.append(key)
-                seeds.setdefault(key, _seed(line, edge.span if key[1] else (-edge.span[1], -edge.span[0]), prior, pair))
-        fits = dict(zip(seeds, fit_edges(window.grey, window.px, [*seeds.values()], window.noise), strict=True))
-        found = []
-        for pair, first, second in zip(pairs, keys[::2], keys[1::2], strict=True):
-            one, other, both = fits[first], fits[second], (seeds[first], seeds[second])
-            if one is None or other is None:
-                found.append(_Found(pair, None, both, pair.score - _NO_FIT))
-            else:
-                found.append(_Found(pair, (one, other), both, pair.score))
-        blur = _sharp_blur(fits.values())
-        return [
-            f if f.fits is None else replace(f, score=f.score + sum(_fit_score(fit, blur) for fit in f.fits))
-            for f in found
-        ]
-
     def _textured(
         self, patch: NDArray[np.float32], centre: Float, lines: list[EdgeLine], prior: OutlinePrior
     ) -> list[EdgeLine]:
@@ -194,45 +158,47 @@ class OutlineFinder:
                 found.append(EdgeLine(turned, sign * rho, (-40.0, 40.0), min(evidence, 12.0)))
         return found
 
-    @staticmethod
-    def _filled(pair: EdgePair, patch: NDArray[np.float32], origin: Float, core_px: Float) -> EdgePair:
-        region = region_score(patch, origin, pair.lines, core_px, 0.5 * pair.width_px)
-        return replace(pair, score=pair.score + region, region=region)
+    def _filled(
+        self, pairs: list[EdgePair], patch: NDArray[np.float32], origin: Float, prior: OutlinePrior
+    ) -> list[EdgePair]:
+        """The hypotheses that are best with what the region between their edges says, best first."""
+        most = self._config.refined_pairs if prior.half_width_px is None else self._config.refined_known
+        best: list[EdgePair] = []
+        for i in range(0, len(pairs), _REGIONS_AT_ONCE):
+            if len(best) == most and pairs[i].score + MOST_BY_REGION < best[-1].score:
+                break  # no other can reach these
+            some = pairs[i : i + _REGIONS_AT_ONCE]
+            half_width = 0.5 * np.array([pair.width_px for pair in some])
+            region = region_scores(patch, origin, np.array([pair.lines for pair in some]), prior.centre_px, half_width)
+            best += [replace(p, score=p.score + r, region=r) for p, r in zip(some, region.tolist(), strict=True)]
+            best = sorted(best, key=lambda pair: -pair.score)[:most]
+        return best
 
-    @staticmethod
-    def _seen(found: _Found, patch: NDArray[np.float32], origin: Float) -> _Found:
-        if found.fits is None:
-            return found
-        lines = np.array([fit.line for fit in found.fits])
-        feet = np.array([fit.foot_px for fit in found.fits])
-        score = occlusion_score(patch, origin, lines, [fit.extent for fit in found.fits], feet)
-        return replace(found, score=found.score + score)
-
-    def _decide(
-        self, stamp_ns: int, pipe_id: str, found: list[_Found], prior: OutlinePrior
-    ) -> OutlineSighting | Rejection:
+    def decide(self, view: OutlineView, found: list[Found]) -> OutlineSighting | Rejection:
+        """The best hypothesis, best first, if it stands out and is good enough."""
+        prior = view.prior
         if not found:
-            return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
+            return self._refuse(view, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
         config = self._config
         scores = np.array([f.score for f in found])
         share = np.exp(scores - scores.max())
-        same = np.array([_same_place(f, found[0], prior.centre_px) for f in found])
+        same = np.array([same_place(f, found[0], prior.centre_px) for f in found])
         quality = float(share[same].sum() / share.sum())
         if quality < self._config.lowest_quality:
-            return self._refuse(stamp_ns, pipe_id, "outline is ambiguous, probability of the best pair of edges",
+            return self._refuse(view, "outline is ambiguous, probability of the best pair of edges",
                                 quality, self._config.lowest_quality)  # fmt: skip
         best = found[0]
         if best.fits is None:
-            return self._refuse(stamp_ns, pipe_id, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
+            return self._refuse(view, "pairs of edges with a sub-pixel fit", 0.0, 1.0)
         if best.pair.surprise > config.largest_surprise:
-            return self._refuse(stamp_ns, pipe_id, "edges lie where they are not expected, chi-square of 2",
+            return self._refuse(view, "edges lie where they are not expected, chi-square of 2",
                                 best.pair.surprise, config.largest_surprise)  # fmt: skip
         trouble = [self._edge_trouble(fit, best.pair.region) for fit in best.fits]
         sure = [t is None for t in trouble]
         # With the width known one sure edge is a measurement; with nothing known both have to be found.
         if not any(sure) or (prior.half_width_px is None and not all(sure)):
-            return self._refuse(stamp_ns, pipe_id, *next(t for t in trouble if t is not None))
-        return self._sighting(stamp_ns, pipe_id, best, prior, quality, sure)
+            return self._refuse(view, *next(t for t in trouble if t is not None))
+        return self._sighting(view, best, quality, sure)
 
     def _edge_trouble(self, fit: EdgeFit, region: float) -> tuple[str, float, float] | None:
         """Why an edge is no measurement: what, how much, limit."""
@@ -245,9 +211,7 @@ class OutlineFinder:
         length = fit.extent[1] - fit.extent[0]
         return ("edge is short, px", length, config.shortest_px) if length < config.shortest_px else None
 
-    def _sighting(
-        self, stamp_ns: int, pipe_id: str, best: _Found, prior: OutlinePrior, quality: float, sure: list[bool]
-    ) -> OutlineSighting:
+    def _sighting(self, view: OutlineView, best: Found, quality: float, sure: list[bool]) -> OutlineSighting:
         assert best.fits is not None
         lines = np.array([fit.line for fit in best.fits])
         feet = np.array([fit.foot_px for fit in best.fits])
@@ -259,73 +223,31 @@ class OutlineFinder:
         anywhere = np.diag([(0.5 * best.pair.width_px) ** 2, 0.1])
         known = zip(best.fits, sure, strict=True)
         covariance = np.array([fit.covariance if good else anywhere for fit, good in known])
-        return OutlineSighting(stamp_ns, self._name, pipe_id, lines, covariance, feet, extent, prior.centre_px, quality)
+        return OutlineSighting(
+            view.stamp_ns, self._name, view.pipe_id, lines, covariance, feet, extent, view.prior.centre_px, quality
+        )
 
     @property
     def _name(self) -> CameraName:
         return self._camera.name  # type: ignore[return-value]
 
-    def _refuse(self, stamp_ns: int, pipe_id: str, reason: str, value: float, limit: float) -> Rejection:
-        return Rejection(stamp_ns, "outline", f"{self._camera.name} {pipe_id}", reason, value, limit)
+    def _refuse(self, view: OutlineView, reason: str, value: float, limit: float) -> Rejection:
+        return Rejection(view.stamp_ns, "outline", f"{self._camera.name} {view.pipe_id}", reason, value, limit)
 
 
-def _seed(line: Float, span: tuple[float, float], prior: OutlinePrior, pair: EdgePair) -> EdgeSeed:
-    """Where the sub-pixel fit of one edge begins."""
-    foot = prior.centre_px - (line[:2] @ prior.centre_px + line[2]) * line[:2]
-    return EdgeSeed(line, foot, (max(span[0] - 4, -75.0), min(span[1] + 4, 75.0)), 0.5 * pair.width_px)
-
-
-def _confirmed(found: list[_Found], window: _Window) -> list[_Found]:
-    """The best hypothesis has its edges in a narrow window as well; one that has not is no fit."""
-    while found and found[0].fits is not None:
-        best = found[0]
-        assert best.fits is not None
-        one, other = confirmed_edges(window.grey, window.px, best.seeds, best.fits, window.noise)
-        if one is not None and other is not None:
-            return [replace(best, fits=(one, other)), *found[1:]]
-        without = replace(best, fits=None, score=best.score - _NO_FIT)
-        found = sorted([without, *found[1:]], key=lambda f: -f.score)
-    return found
-
-
-def _outermost(found: list[_Found], penalty: float = 1.5) -> list[_Found]:
-    """Lowers hypotheses that lie within another likely one: highlights and the pipe's own shadow have edges as well."""
-    result = []
-    for inner in found:
-        nested = any(outer is not inner and outer.fits is not None and _contains(outer, inner) for outer in found)
-        result.append(replace(inner, score=inner.score - penalty * nested))
-    return sorted(result, key=lambda f: -f.score)
-
-
-def _same_place(one: _Found, other: _Found, centre_px: Float) -> bool:
-    """True when two hypotheses mean the same two edges (seeds differ; what they were fitted to does not)."""
-    nearest = _NEAR_FITTED_PX if one.fits is not None and other.fits is not None else _NEAR_SEEDS_PX
-    lines = [np.array([f.line for f in h.fits]) if h.fits is not None else h.pair.lines for h in (one, other)]
-    first, second = (line @ np.append(centre_px, 1.0) for line in lines)
-    if lines[0][0, :2] @ lines[1][0, :2] < 0:
-        second = second[::-1]
-    return bool(np.abs(first - second).max() < nearest)
-
-
-def _contains(outer: _Found, inner: _Found) -> bool:
-    """True when both edges of `outer` lie at or outside those of `inner`, one clearly so."""
-    if outer.pair.width_px < inner.pair.width_px + 1.5 or outer.pair.surprise > 6.0:
-        return False
-    shift = abs(outer.pair.middle_px - inner.pair.middle_px)
-    return shift < 0.5 * (outer.pair.width_px - inner.pair.width_px) + 0.8
-
-
-def _fit_score(fit: EdgeFit, blur_px: float) -> float:
-    """Log-likelihood that an edge is one sharp straight step, for which shading and highlights are too soft."""
-    step = float(np.clip(12.0 * (fit.sharpness - 0.65), -5.0, 2.0))
-    soft = max(np.log(fit.blur_px / blur_px), 0.0) / 0.25
-    return 4.0 * (fit.supported / fit.stretches - 1.0) + step - 0.5 * float(soft**2)
-
-
-def _sharp_blur(fits: Iterable[EdgeFit | None]) -> float:
-    """Blur that a sharp edge has in this image, from the sharper edges about the pipe; at least the usual 0.6 px."""
-    values = [fit.blur_px for fit in fits if fit is not None and fit.sharpness > 0.75]
-    return max(0.6, float(np.quantile(values, 0.25))) if values else 0.6
+def find_outlines(views: Sequence[OutlineView]) -> list[OutlineSighting | Rejection]:
+    """The outline in each picture, or why there is none; the edges of all of them are fitted together."""
+    begun = [view.finder.begin(view) for view in views]
+    going = [one for one in begun if isinstance(one, Begun)]
+    found = [
+        outermost(sorted((seen_sides(hypothesis, one) for hypothesis in hypotheses), key=lambda f: -f.score))
+        for one, hypotheses in zip(going, refined(going), strict=True)
+    ]
+    best = iter(confirmed(found, [one.window for one in going]))
+    return [
+        one if isinstance(one, Rejection) else view.finder.decide(view, next(best))
+        for view, one in zip(views, begun, strict=True)
+    ]
 
 
 def silhouette_sighting(

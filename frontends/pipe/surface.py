@@ -14,6 +14,8 @@ _BIN_PX = 2
 _REGION_PX = 30
 _INDEPENDENT = 6.0
 """Independent bits of texture along a strip of 60 px: bricks and stains are that large."""
+MOST_BY_REGION = 15.0
+"""What the texture says at most, however wide a pipe is."""
 
 
 def occlusion_score(
@@ -77,8 +79,8 @@ def flat(values: Float) -> Float:
     return values - values.mean(axis=-1, keepdims=True) - trend[..., None] * place
 
 
-def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, half_width_px: float) -> float:
-    """Log-likelihood ratio that a pipe fills the space between two edges, by the texture along it.
+def region_scores(patch: Float32, origin: Float, lines: Float, core_px: Float, half_width_px: Float) -> Float:
+    """Log-likelihood ratios that a pipe fills the space between two edges, by the texture along it, one per pair.
 
     A pipe's grey value goes on along its axis, that of a wall behind mostly does not. Strips of the image along the
     axis are told apart by their variance; where pipe and background are alike in it, the score is 0.
@@ -86,40 +88,59 @@ def region_score(patch: Float32, origin: Float, lines: Float, core_px: Float, ha
     Args:
         patch: Shape (h, w), ideal pixels, NaN outside the image.
         origin: Shape (2,), the patch's first pixel in ideal pixels.
-        lines: Shape (2, 3), the edges, positive outside.
+        lines: Shape (pairs, 2, 3), the edges, positive outside.
         core_px: Shape (2,), a point on the pipe.
-        half_width_px: Half its width.
+        half_width_px: Shape (pairs,), half its width.
+
+    Returns:
+        Shape (pairs,), none beyond `MOST_BY_REGION`.
     """
-    across = lines[0, :2] - lines[1, :2]
-    across = across / np.linalg.norm(across)
-    axis = np.array([-across[1], across[0]])
-    reach = int(half_width_px * 1.3) + 10
-    place = np.arange(-reach, reach + 1.0)
-    along = np.arange(-_REGION_PX, _REGION_PX + 1.0)
-    grid = core_px - origin + place[:, None, None] * across + along[:, None] * axis
-    strips = sampled(patch, grid)
-    if (np.isfinite(strips).mean(axis=1) <= 0.99).any():
-        return 0.0
-    smooth = (
-        strips.reshape(len(place), -1).astype(float)[:, : 3 * (len(along) // 3)].reshape(len(place), -1, 3).mean(axis=2)
-    )
-    variance = flat(smooth).var(axis=1) + 0.5
+    across = lines[:, 0, :2] - lines[:, 1, :2]
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    reach = (half_width_px * 1.3).astype(int) + 10
+    place = np.arange(-reach.max(), reach.max() + 1.0)
+    near = np.abs(place) <= reach[:, None]
+    variance, known = _restlessness(patch, core_px - origin, across, place)
     inside = _signed(lines, core_px, place, across)
-    pipe = median(variance[np.abs(place) <= max(2.0, 0.4 * half_width_px)])
-    wall = median(variance[inside < -2.0]) if (inside < -2.0).any() else pipe
-    if wall < 2.0 * pipe:
-        return 0.0
+    core, beyond = np.abs(place) <= np.maximum(2.0, 0.4 * half_width_px)[:, None], near & (inside < -2.0)
+    pipe = _medians(variance, core)
+    wall = np.where(beyond.any(axis=1), _medians(variance, beyond), pipe)
+    told = (known | ~near).all(axis=1) & (wall >= 2.0 * pipe)
+    pipe, wall = np.where(told, (pipe, wall), [[1.0], [2.0]])[..., None]
     likeness = 0.5 * _INDEPENDENT * (np.log(wall / pipe) - variance * (1 / pipe - 1 / wall))
-    likeness = np.clip(likeness, -3.0, 3.0)
+    likeness = np.where(near, np.clip(likeness, -3.0, 3.0), 0.0)
     # Strips next to an edge hold both sides; beyond 6 px another thing may begin.
-    score = likeness[inside > 1.0].sum() - likeness[(inside < -1.0) & (inside > -6.0)].sum()
-    return float(np.clip(0.4 * score, -15.0, 15.0))
+    score = (likeness * (inside > 1.0)).sum(axis=1) - (likeness * ((inside < -1.0) & (inside > -6.0))).sum(axis=1)
+    return np.where(told, np.clip(0.4 * score, -MOST_BY_REGION, MOST_BY_REGION), 0.0)
+
+
+def _restlessness(patch: Float32, core: Float, across: Float, place: Float) -> tuple[Float, NDArray[np.bool_]]:
+    """Variance of the grey value along strips at places (n,) across each direction (pairs, 2), and where it is known,
+    shape (pairs, n)."""
+    along = np.arange(-_REGION_PX, _REGION_PX + 1.0)
+    axis = np.stack((-across[:, 1], across[:, 0]), axis=1)
+    grid = core + place[:, None, None] * across[:, None, None] + along[:, None] * axis[:, None, None]
+    strips = sampled(patch, grid)
+    known = np.isfinite(strips.sum(axis=2))
+    thirds = len(along) // 3 * 3
+    smooth = sum((strips[..., i:thirds:3] for i in (1, 2)), strips[..., 0:thirds:3]).astype(float) / 3
+    return np.where(known, flat(np.where(known[..., None], smooth, 0.0)).var(axis=-1), 0.0) + 0.5, known
+
+
+def _medians(values: Float, used: NDArray[np.bool_]) -> Float:
+    """Of the values of each row that are used, (rows,); infinite where there are none."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=1)
+    row, count = np.arange(len(values)), used.sum(axis=1)
+    return 0.5 * (
+        ordered[row, np.maximum(count - 1, 0) // 2] + ordered[row, np.minimum(count // 2, len(ordered.T) - 1)]
+    )
 
 
 def _signed(lines: Float, core_px: Float, place: Float, across: Float) -> Float:
-    """Distance inside the nearer edge for places across the pipe, negative outside."""
-    px = np.column_stack((core_px + place[:, None] * across, np.ones(len(place))))
-    return -(px @ lines.T).max(axis=1)
+    """Distance inside the nearer edge for places (n,) across pipes, negative outside, shape (pairs, n)."""
+    at_core = lines[..., :2] @ core_px + lines[..., 2]
+    slope = np.einsum("pij,pj->pi", lines[..., :2], across)
+    return -(at_core[..., None] + slope[..., None] * place).max(axis=1)
 
 
 def region_edges(patch: Float32, centre: Float, angle: float, widest_px: float) -> list[tuple[float, float]]:
