@@ -9,7 +9,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, diags, identity, vstack
+from scipy.sparse import csr_matrix, diags, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -62,28 +62,32 @@ class LinearSystem:
     """
 
     def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        linear = graph.linearize(values)
+        self.linear = graph.linearize(values)
         self.rows = np.array([graph.at(i).dim() for i in range(graph.size())])
         self.starts = np.concatenate([[0], np.cumsum(self.rows)])
-        entries = np.asarray(linear.sparseJacobian_())
-        keys = list(linear.keyVector())
         zero = values.zeroVectors()
         self.columns: dict[int, slice] = {}
         column = 0
-        for key in sorted(keys):
+        for key in sorted(self.linear.keyVector()):
             size = zero.at(key).size
             self.columns[key] = slice(column, column + size)
             column += size
-        i, j = entries[0].astype(int) - 1, entries[1].astype(int) - 1
-        shape = (int(self.starts[-1]), column)
-        keep = j < column
-        self.A = csr_matrix((entries[2][keep], (i[keep], j[keep])), shape=shape)
-        self.b = np.zeros(shape[0])
-        self.b[i[~keep]] = entries[2][~keep]
         self._columns = column
+        self._entries = np.asarray(self.linear.sparseJacobian_())
+        right = np.flatnonzero(self._entries[1] > column)
+        self.b = np.zeros(int(self.starts[-1]))
+        self.b[self._entries[0, right].astype(np.int32) - 1] = self._entries[2, right]
         self.root: csr_matrix | None = None
         """Shape (rows, rows): times its transpose the covariance of the whitened errors, where they are correlated;
         None for the identity."""
+
+    @cached_property
+    def A(self) -> csr_matrix:
+        """Shape (rows, parameters). Residuals alone do without."""
+        i, j, data = self._entries
+        left = j <= self._columns
+        place = i[left].astype(np.int32) - 1, j[left].astype(np.int32) - 1
+        return csr_matrix((data[left], place), shape=(len(self.b), self._columns))
 
     @cached_property
     def _normal(self) -> NormalEquations:
@@ -93,16 +97,6 @@ class LinearSystem:
     @property
     def parameters(self) -> int:
         return self._columns
-
-    def touching(self, keys: Sequence[int]) -> list[list[int]]:
-        """Positions of the factors that each variable is in."""
-        by_column = csc_matrix(self.A)
-        found = []
-        for key in keys:
-            column = self.columns[key]
-            rows = by_column.indices[by_column.indptr[column.start] : by_column.indptr[column.stop]]
-            found.append(np.unique(np.searchsorted(self.starts, rows, side="right") - 1).tolist())
-        return found
 
     @property
     def _together(self) -> int:
@@ -118,8 +112,23 @@ class LinearSystem:
         None where they are too many."""
         return self._normal.rest_inverse()
 
-    def weighed_rows(self, root_weight: Float) -> "LinearSystem":
-        """The system of the same factors with other weights, at its own solution.
+    def settled(self) -> "tuple[LinearSystem, Float, float]":
+        """The same with the residuals of its solution, the step (n,) to there, and its gain of half the squares."""
+        pull = self.A.T @ self.b
+        step = self.solve(pull[:, None])[:, 0]
+        other = copy(self)
+        other.b = self.b - self.A @ step
+        return other, step, 0.5 * float(pull @ step)
+
+    def moved(self, values: gtsam.Values, step: Float) -> gtsam.Values:
+        """The estimate a step (n,) on."""
+        delta = gtsam.VectorValues()
+        for key, columns in self.columns.items():
+            delta.insert(key, step[columns])
+        return values.retract(delta)
+
+    def weighed_rows(self, root_weight: Float) -> "tuple[LinearSystem, Float]":
+        """The system of the same factors with other weights, at its own solution, and the step (n,) to there.
 
         Args:
             root_weight: shape (rows,), one over the factors of the rows' standard deviations.
@@ -129,8 +138,7 @@ class LinearSystem:
         other.root = None
         other.A = csr_matrix(diags(root_weight) @ self.A)
         other.b = root_weight * self.b
-        other.b = other.b - other.A @ other.solve((other.A.T @ other.b)[:, None])[:, 0]
-        return other
+        return other.settled()[:2]
 
     def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""

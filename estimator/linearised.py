@@ -1,6 +1,6 @@
 """All factors at an estimate: where they come from, the linear system that they make, and their residuals."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -35,6 +35,15 @@ class Linearised:
             graph.add(factor)
         return graph
 
+    def touching(self, variables: Sequence[int]) -> list[list[int]]:
+        """Positions of the factors that each variable is in."""
+        found: dict[int, list[int]] = {key: [] for key in variables}
+        for position, (_, factor, _) in enumerate(self.active):
+            for key in factor.keys():
+                if key in found:
+                    found[key].append(position)
+        return list(found.values())
+
 
 def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
     """The factors of a log, without those that are off, at an estimate."""
@@ -56,6 +65,18 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
     scale = np.array([robust_scale(robust_sigma, int(n)) for n in range(1, int(system.rows.max()) + 1)])
     scale = scale[system.rows - 1]
     return np.where(rejectable & (softened > scale), softened**2 / scale, softened)
+
+
+def settled(at: Linearised, robust_sigma: float) -> tuple[Linearised, float]:
+    """One Gauss-Newton step on, nothing linearised anew; and what the step gains of half the chi-square.
+
+    Raises:
+        Undetermined: a variable.
+    """
+    system, step, gain = at.system.settled()
+    rejectable = np.array([record.rejectable for _, _, record in at.active])
+    norms = residual_norms(system, rejectable, robust_sigma)
+    return Linearised(system.moved(at.values, step), at.active, system, norms, at.inflation), gain
 
 
 def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> Linearised:

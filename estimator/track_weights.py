@@ -48,6 +48,8 @@ class TrackWeights:
     """Information over what is stated, by the positions of factors; empty where tracks are alike."""
     slack: float = 1.0
     """Standard deviations of the estimate over those that weights known beforehand would give."""
+    step: Float | None = None
+    """Shape (n,), from the system's solution to nearly the one with these weights; None where tracks are alike."""
 
 
 def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWeights:
@@ -67,9 +69,11 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWei
         return TrackWeights({})
     weight = np.ones(len(tracks))
     spread: tuple[float, float] | None = None
-    dof = weight
+    dof, step, weighed = weight, None, system
     for _ in range(ROUNDS):
-        chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
+        if spread is not None:
+            weighed, step = _weighed(system, tracks, weight)
+        chi2, dof = residuals_of_tracks(tracks, weighed)
         spread = spread or spread_of_variances(chi2, dof)
         width, scale = spread
         weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
@@ -77,11 +81,11 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWei
             return TrackWeights({})
     slack = float(((spread[0] + dof + 2.0) / (spread[0] + dof) * dof).sum() / dof.sum()) if spread else 1.0
     return TrackWeights(
-        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack
+        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack, step
     )
 
 
-def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> LinearSystem:
+def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> tuple[LinearSystem, Float]:
     root = np.ones(len(system.b))
     for (_, positions), w in zip(tracks, weight, strict=True):
         root[_rows(system, positions)] = np.sqrt(w)
