@@ -107,6 +107,14 @@ class LinearSystem:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
         return self._normal.solve(right)
 
+    def residuals_of(self, errors: Float) -> Float:
+        """What the adjustment leaves of errors of the measurements, both (rows, k)."""
+        left = np.empty_like(errors)
+        for start in range(0, errors.shape[1], self._together):
+            part = errors[:, start : start + self._together]
+            left[:, start : start + self._together] = part - self.A @ self.solve(self.A.T @ part)
+        return left
+
     def rest_covariance(self) -> tuple[NDArray[np.int64], Float | None]:
         """Place (n,) of every unknown among those that are no landmark, -1 for landmarks, and the covariance of those;
         None where they are too many."""
