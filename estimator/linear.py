@@ -9,7 +9,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix, diags, identity, vstack
+from scipy.sparse import block_diag, csr_matrix, diags, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
@@ -92,7 +92,11 @@ class LinearSystem:
     @cached_property
     def _normal(self) -> NormalEquations:
         """Only covariances need it, residuals do not."""
-        return NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
+        return NormalEquations(self._information, self.columns)
+
+    @cached_property
+    def _information(self) -> csr_matrix:
+        return csr_matrix(self.A.T @ self.A)
 
     @property
     def parameters(self) -> int:
@@ -141,12 +145,41 @@ class LinearSystem:
         Args:
             root_weight: shape (rows,), one over the factors of the rows' standard deviations.
         """
+        return self._other(csr_matrix(diags(root_weight) @ self.A), root_weight * self.b).settled()[:2]
+
+    def exchanged(
+        self, removed: Sequence[int], graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> "LinearSystem":
+        """The system with other factors of the same variables in the place of some; their errors are independent.
+
+        Args:
+            removed: positions of factors.
+            graph: the new ones, which come after those that stay.
+            values: where they are linearised; the others stay as they are.
+        """
+        new = LinearSystem(graph, values)
+        place = np.concatenate([np.arange(self.parameters)[self.columns[key]] for key in new.columns])
+        J = new.A.tocoo()
+        J = csr_matrix((J.data, (J.row, place[J.col])), shape=(len(new.b), self.parameters))
+        stays = np.ones(len(self.rows), bool)
+        stays[removed] = False
+        rows = np.repeat(stays, self.rows)
+        other = self._other(csr_matrix(vstack([self.A[rows], J])), np.concatenate([self.b[rows], new.b]))
+        gone = self.A[~rows]
+        other._information = csr_matrix(self._information - gone.T @ gone + J.T @ J)
+        other.rows = np.concatenate([self.rows[stays], new.rows])
+        other.starts = np.concatenate([[0], np.cumsum(other.rows)])
+        if self.root is not None:
+            other.root = csr_matrix(block_diag((self.root[rows][:, rows], identity(len(new.b)))))
+        return other
+
+    def _other(self, A: csr_matrix, b: Float) -> "LinearSystem":
+        """Of the same variables."""
         other = copy(self)
-        other.__dict__.pop("_normal", None)
-        other.root = None
-        other.A = csr_matrix(diags(root_weight) @ self.A)
-        other.b = root_weight * self.b
-        return other.settled()[:2]
+        for cached in ("_normal", "_information"):
+            other.__dict__.pop(cached, None)
+        other.A, other.b, other.root = A, b, None
+        return other
 
     def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""
