@@ -98,9 +98,9 @@ class _Neighbourhood:
         neighbours = min(_NEIGHBOURS, len(cloud.points_m))
         found = tree.query(landmarks, k=neighbours, distance_upper_bound=1.5 * config.largest_radius_m)
         distance, index = np.asarray(found[0]), np.asarray(found[1], np.int64)
-        pairs = np.asarray(tree.query(cloud.points_m, k=2)[0])
-        gaps = np.append(pairs[:, 1], np.nan)
-        spacing = np.nan_to_num(gaps[index[:, 0]], nan=config.largest_radius_m)
+        spacing = np.full(len(landmarks), config.largest_radius_m)
+        some = index[:, 0] < len(cloud.points_m)
+        spacing[some] = np.asarray(tree.query(cloud.points_m[index[some, 0]], k=2)[0])[:, 1]
         radius = np.clip(np.maximum(2.5 * spacing, 2.0 * sigma), config.smallest_radius_m, config.largest_radius_m)
         # The foot on the surface is what counts, so the landmark's own distance from it does not use up the radius.
         reach = np.hypot(radius, np.where(np.isfinite(distance[:, 0]), distance[:, 0], 0.0))
