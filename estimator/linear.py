@@ -15,12 +15,13 @@ from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
 
 Float = NDArray[np.float64]
+Blocks = Sequence[tuple[int, Float]]
 
 DETERMINED = 1e-3
 """A residual direction with less than this share of its own variance left is determined by its own measurement."""
 
-CHUNK = 384
-"""Right-hand sides that are solved together, at most."""
+CHUNK = 64
+"""Right-hand sides that are solved together, at most: more of them only fill the caches."""
 CHUNK_ENTRIES = 8_000_000
 """... and entries (rows of the system times right-hand sides): 64 MB, however long the recording."""
 
@@ -181,14 +182,14 @@ class LinearSystem:
         other.A, other.b, other.root = A, b, None
         return other
 
-    def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def selector(self, blocks: Blocks) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""
         full = np.zeros((self.parameters, blocks[0][1].shape[0]))
         for key, J in blocks:
             full[self.columns[key]] += J.T
         return full
 
-    def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def influence(self, blocks: Blocks) -> Float:
         """`R^T A (A^T A)^-1 J^T`, shape (rows, m), R R^T the errors' covariance: its squares are the contributions.
 
         With R = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the errors as they
@@ -205,7 +206,7 @@ class LinearSystem:
         root = (csr_matrix(identity(len(self.b))) if self.root is None else self.root)[rows]
         return np.asarray((root @ root.T).todense())
 
-    def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def covariance(self, blocks: Blocks) -> Float:
         """Covariance of `J x`, shape (m, m)."""
         influence = self.influence(blocks)
         return influence.T @ influence
@@ -219,17 +220,20 @@ class LinearSystem:
 
     def marginals(self, keys: Sequence[int]) -> list[Float]:
         """Each variable's own covariance."""
+        if self.root is not None:
+            return self.covariances([[(k, np.eye(self.columns[k].stop - self.columns[k].start))] for k in keys])
         found = []
         for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys], self._together):
-            columns = [self.columns[keys[i]] for i in chunk]
-            if self.root is None:
-                found += self._normal.inverse_blocks(columns)
-                continue
-            right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
-            at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
-            for column, (start, stop) in zip(columns, pairwise(at), strict=True):
-                right[column, start:stop] = np.eye(stop - start)
-            influence = self.weigh(self.A @ self.solve(right))
+            found += self._normal.inverse_blocks([self.columns[keys[i]] for i in chunk])
+        return found
+
+    def covariances(self, of: Sequence[Blocks]) -> list[Float]:
+        """Covariance of each of several `J x` alone, given by blocks (key, J of shape (m, dim))."""
+        found = []
+        for chunk in _chunks([blocks[0][1].shape[0] for blocks in of], self._together):
+            right = [self.selector(of[i]) for i in chunk]
+            influence = self.weigh(self.A @ self.solve(np.hstack(right)))
+            at = np.concatenate([[0], np.cumsum([r.shape[1] for r in right])])
             found += [influence[:, a:b].T @ influence[:, a:b] for a, b in pairwise(at)]
         return found
 
