@@ -198,12 +198,18 @@ class Summary:
     def _budget(self, influence: Float) -> dict[str, Float]:
         """Share of every source in a covariance: with A the whitened Jacobian, J (A^T A)^-1 J^T is the sum over the
         rows of A of (J (A^T A)^-1 a_i)^2, so the sources' shares sum to it exactly."""
-        shares: dict[str, Float] = {}
-        for position, (_, _, record) in enumerate(self._active):
-            rows = influence[self._system.starts[position] : self._system.starts[position + 1]]
-            name = f"{record.family}: {record.source}" if record.source != record.family else record.family
-            shares[name] = shares.get(name, np.zeros((3, 3))) + rows.T @ rows
-        return dict(sorted(shares.items(), key=lambda item: -float(np.trace(item[1]))))
+        names, group = self._sources()
+        products = influence[:, :, None] * influence[:, None, :]
+        shares = np.stack([np.bincount(group, p, len(names)) for p in products.reshape(len(group), -1).T], axis=-1)
+        order = np.argsort(-np.trace(shares.reshape(-1, 3, 3), axis1=1, axis2=2), kind="stable")
+        return {names[i]: shares[i].reshape(3, 3) for i in order}
+
+    def _sources(self) -> tuple[list[str], NDArray[np.int64]]:
+        """Names of what the rows of the system come from, and which one each row (rows,) does."""
+        place: dict[tuple[str, str], int] = {}
+        group = [place.setdefault((r.family, r.source), len(place)) for _, _, r in self._active]
+        names = [f"{family}: {source}" if source != family else family for family, source in place]
+        return names, np.repeat(group, self._system.rows)
 
     def _pipes(self, points: tuple[PointEstimate, ...]) -> tuple[PipeEstimate, ...]:
         found = []
