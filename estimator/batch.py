@@ -16,7 +16,7 @@ from .corner_variance import weights as corner_weights
 from .graph import FactorLog, Record
 from .linear import deviate
 from .linearised import Linearised, linearise, settled, with_correlated_tracks
-from .newton import ON_THE_WAY, optimum, step_with
+from .newton import ON_THE_WAY, Elimination, optimum, step_with
 from .observability import Undetermined
 from .odometry import FAMILY as ODOMETRY
 from .track_weights import track_weights
@@ -62,7 +62,8 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
     """The robust optimum; then what is beyond noise is taken out, first by its residual, then by snooping."""
     off: set[int] = set()
     rejected: list[Rejection] = []
-    first, iterations = optimum(log.graph(), start, ON_THE_WAY)
+    elimination = Elimination()
+    first, iterations = optimum(log.graph(), start, ON_THE_WAY, elimination)
     at = linearise(log, off, first, robust_sigma)
     for finder, rounds in ((outliers, 3), (snooped, SNOOPING_ROUNDS)):
         for _ in range(rounds):
@@ -73,7 +74,7 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             found += orphans(at, off)
             off |= {i for i, _ in found}
             rejected += [r for _, r in found]
-            at, more = _without(log, off, at, robust_sigma)
+            at, more = _without(log, off, at, robust_sigma, elimination)
             iterations += more
     at = settled(at, robust_sigma)[0]
     variance = corner_variance(at)
@@ -83,14 +84,16 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
     return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
 
 
-def _without(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[Linearised, int]:
+def _without(
+    log: FactorLog, off: set[int], at: Linearised, robust_sigma: float, elimination: Elimination
+) -> tuple[Linearised, int]:
     """Without some factors: near enough to the optimum of the others to go on, and the iterations to there.
 
     One step is, from the optimum that they were part of, unless much changes.
     """
     for iteration in range(1, MOST_ROUNDS + 1):
         kept = [p for p, (i, _, _) in enumerate(at.active) if i not in off]
-        values = step_with(at.system.linear, kept, at.values)
+        values = step_with(at.system.linear, kept, at.values, elimination)
         if values is None:
             break
         before = float((at.norms[kept] ** 2).sum())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..factors import keys
 from .graph import FactorLog, Record, Update
 from .marginal import FAMILY, GaussianPrior, carried, gaussian_of, joint_of, marginal, renamed, without
-from .newton import gain
+from .newton import Elimination, gain
 from .observability import Undetermined, determined
 
 Float = NDArray[np.float64]
@@ -296,13 +296,11 @@ class Incremental:
         up to a fifth of a sigma, is made up for here. That takes a fraction of the time that relinearising in place
         takes, because the elimination is ordered for the whole graph.
         """
-        graph, ordering = self.log.graph(), None
+        graph, elimination = self.log.graph(), Elimination()
         for _ in range(rounds - 1):
             linear = graph.linearize(self._values)
-            ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
             try:
-                with determined():
-                    step = linear.optimize(ordering)
+                step = elimination.solved(linear)
             except Undetermined:
                 break  # beginning anew gets across, or gives up a landmark
             self._values = self._values.retract(step)

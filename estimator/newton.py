@@ -13,32 +13,61 @@ NOTHING = 1e-4
 MOST_ITERATIONS = 40
 
 
+class Elimination:
+    """Solves linearised graphs of hardly ever different variables: in what order is found out once, which takes as long
+    as half a solution."""
+
+    def __init__(self) -> None:
+        self._ordering = gtsam.Ordering()
+
+    def solved(self, linear: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
+        """
+        Raises:
+            Undetermined: a variable.
+        """
+        present = linear.keys()
+        if self._ordering.size() != present.size():
+            self._ordering = self._among(linear, present)
+        with determined():
+            return linear.optimize(self._ordering)
+
+    def _among(self, linear: gtsam.GaussianFactorGraph, present: gtsam.KeySet) -> gtsam.Ordering:
+        """The known order, without variables that are gone; a new one where there are others."""
+        left = gtsam.Ordering()
+        for i in range(self._ordering.size()):
+            if present.count(key := self._ordering.at(i)):
+                left.push_back(key)
+        return left if left.size() == present.size() else gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+
+
 def optimum(
-    graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, tolerance: float = CONVERGED
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    tolerance: float = CONVERGED,
+    elimination: Elimination | None = None,
 ) -> tuple[gtsam.Values, int]:
     """The optimum from a start near it, and the number of iterations.
 
     Gauss-Newton, whose steps take two thirds of the time of Levenberg-Marquardt's; the latter where a step makes it
     worse or cannot be taken.
     """
-    return _undamped(graph, start, tolerance) or _damped(graph, start, tolerance)
+    found = _undamped(graph, start, tolerance, elimination or Elimination())
+    return found or _damped(graph, start, tolerance)
 
 
 def _undamped(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, tolerance: float
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, tolerance: float, elimination: Elimination
 ) -> tuple[gtsam.Values, int] | None:
     """Gauss-Newton; None where that does not get there.
 
     How much a step gains is known before it is taken: where that is next to nothing, there is no need to look whether
     it was gained.
     """
-    error, ordering = graph.error(values), None
+    error = graph.error(values)
     for iteration in range(1, MOST_ITERATIONS + 1):
         linear = graph.linearize(values)
-        ordering = ordering or gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         try:
-            with determined():
-                step = linear.optimize(ordering)
+            step = elimination.solved(linear)
         except Undetermined:
             return None
         values = values.retract(step)
@@ -68,7 +97,9 @@ def gain(linear: gtsam.GaussianFactorGraph, step: gtsam.VectorValues) -> float:
     return -0.5 * linear.gradientAtZero().dot(step)
 
 
-def step_with(linear: gtsam.GaussianFactorGraph, kept: Sequence[int], values: gtsam.Values) -> gtsam.Values | None:
+def step_with(
+    linear: gtsam.GaussianFactorGraph, kept: Sequence[int], values: gtsam.Values, elimination: Elimination
+) -> gtsam.Values | None:
     """One Gauss-Newton step with some factors of a linearised graph; None where they determine no step.
 
     Args:
@@ -79,7 +110,6 @@ def step_with(linear: gtsam.GaussianFactorGraph, kept: Sequence[int], values: gt
     for place in kept:
         part.push_back(linear.at(place))
     try:
-        with determined():
-            return values.retract(part.optimize())
+        return values.retract(elimination.solved(part))
     except Undetermined:
         return None
