@@ -40,7 +40,7 @@ RELINEARIZE_EVERY = 10
 """Updates between relinearisations: calibration states tie everything together, so that each one costs a fair part
 of a batch solution; `settle` makes up for what is left at the end."""
 
-SETTLED = 1.0
+SETTLED = 0.2
 """Gain in half the chi-square of a step after which iSAM2 takes the last one: what that leaves is a small part of it,
 shared among all variables."""
 

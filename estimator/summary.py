@@ -202,7 +202,7 @@ class Summary:
         products = influence[:, :, None] * influence[:, None, :]
         shares = np.stack([np.bincount(group, p, len(names)) for p in products.reshape(len(group), -1).T], axis=-1)
         order = np.argsort(-np.trace(shares.reshape(-1, 3, 3), axis1=1, axis2=2), kind="stable")
-        return {names[i]: shares[i].reshape(3, 3) for i in order}
+        return {names[i]: np.asarray(shares[i].reshape(3, 3), np.float64) for i in order}
 
     def _sources(self) -> tuple[list[str], NDArray[np.int64]]:
         """Names of what the rows of the system come from, and which one each row (rows,) does."""
