@@ -9,7 +9,7 @@ from surecut.estimator.engine import Engine
 from surecut.estimator.result import Consistency
 from surecut.estimator.stream import audits as module
 from surecut.estimator.stream.audit import Audit
-from surecut.estimator.stream.audits import Audits
+from surecut.estimator.stream.audits import SOONER, Audits
 from surecut.factors.errors import ObservabilityError
 
 PERIOD = 20 * 10**9
@@ -56,9 +56,16 @@ def test_the_last_outcome_holds_until_the_next_is_due(model: Model, monkeypatch:
     audits = Audits(cast(Engine, model), PERIOD, apart=False)
     assert audits.widening("P1") == 1.0
     assert at(audits, model, PERIOD)
-    assert not at(audits, model, PERIOD + PERIOD // 2)  # a second audit would have no outcome
+    assert not at(audits, model, PERIOD + PERIOD // SOONER - 1)  # a second audit would have no outcome
     assert (audits.widening("P1"), audits.widening("P2")) == (1.5, 1.0)
     assert audits.consistency() is PASSED.consistency
+
+
+def test_the_first_ones_come_soon(model: Model, monkeypatch: pytest.MonkeyPatch):
+    outcomes(monkeypatch, *[PASSED] * 20)
+    audits = Audits(cast(Engine, model), PERIOD, apart=False)
+    quarters = [q for q in range(1, 20) if at(audits, model, q * PERIOD // SOONER)]
+    assert quarters == [1, 2, 3, 5, 9, 13, 17]
 
 
 def test_audits_that_fail_for_long_are_told(model: Model, monkeypatch: pytest.MonkeyPatch):

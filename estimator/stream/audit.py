@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
@@ -12,12 +13,15 @@ from ..batch import without_factors
 from ..consistency import family_tests, judge, prior_tests
 from ..engine import Engine
 from ..graph import FactorLog
+from ..linear import LinearSystem
 from ..linearised import linearise, with_correlated_tracks
 from ..marginal import FAMILY
 from ..observability import Undetermined, determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
 from ..result import Consistency
+
+Float = NDArray[np.float64]
 
 TESTED = ("mount", "known distances", "board geometry", "calibration priors")
 NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
@@ -29,7 +33,7 @@ class Audit:
 
     consistency: Consistency = NOT_TESTED
     widening: Mapping[str, float] = field(default_factory=dict)
-    """By point: factor on its covariance, at least 1."""
+    """By point, and by pose (`m` of the newest keyframe, `b`, boards): factor on its covariance, at least 1."""
 
 
 def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, set[int]]:
@@ -67,14 +71,24 @@ def audit(engine: Engine) -> Audit:
         system.root = csr_matrix(diags(wider) @ system.root)
     families = tuple(f for f in family_tests(at) if f.family != FAMILY)
     consistency = judge(families, prior_tests(at.active, system, TESTED), {})
-    widening = {}
+    return Audit(consistency, _widening(engine, at.system, values))
+
+
+def _widening(engine: Engine, system: LinearSystem, values: gtsam.Values) -> dict[str, float]:
+    """What correlated tracks do to the covariances of points in {b} and of poses, as one factor each."""
+    asked: dict[str, list[tuple[int, Float]]] = {}
     if values.exists(keys.base(0)):
         for point in engine.pipes.points.values():
             if point.known:
-                _, blocks = point_blocks(values, keys.base(0), keys.point(point.index))
-                wide = np.trace(system.covariance(blocks))
-                root, system.root = system.root, None
-                plain = np.trace(system.covariance(blocks))
-                system.root = root
-                widening[point.id] = max(float(wide / plain), 1.0)
-    return Audit(consistency, widening)
+                asked[point.id] = point_blocks(values, keys.base(0), keys.point(point.index))[1]
+    newest = keys.keyframe(engine.odometry.last_keyframe)
+    poses = {"m": newest, "b": keys.base(0), **{b.id: engine.boards.key(b.id) for b in engine.rig.boards}}
+    asked |= {name: [(key, np.eye(6))] for name, key in poses.items() if key in system.columns}
+    wide = {name: system.covariance(blocks) for name, blocks in asked.items()}
+    system.root = None
+    return {name: _factor(wide[name], system.covariance(blocks)) for name, blocks in asked.items()}
+
+
+def _factor(wide: Float, plain: Float) -> float:
+    """How much wider, on average over the directions."""
+    return max(float(np.trace(np.linalg.solve(plain, wide)) / len(plain)), 1.0)

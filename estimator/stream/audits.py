@@ -9,6 +9,8 @@ from ..result import Consistency
 from .audit import Audit, audit
 from .settings import S
 
+SOONER = 4
+"""The first one comes so many times sooner than a period, and the next after as long again."""
 TO_FAIL = 3
 """Periods in which every audit failed after which the model counts as not consistent: nobody knows."""
 
@@ -27,6 +29,7 @@ class Audits:
         self._period_ns = period_ns
         self._aside: Aside[Audit] = Aside(apart)
         self._next_ns = 0
+        self._first_ns: int | None = None
         self._last = Audit()
         self._failing: tuple[int, str] | None = None
         """Since when, and why."""
@@ -39,10 +42,17 @@ class Audits:
         engine = self._engine
         if engine.odometry.last_keyframe < 0 or engine.graph.unsolved or self._aside.busy():
             return
-        self._next_ns = stamp_ns + self._period_ns
+        self._next_ns = stamp_ns + self._pause_ns(stamp_ns)
         if engine.boards.any_known():
             engine.revisit()
         self._aside.begin(lambda: audit(engine))
+
+    def _pause_ns(self, stamp_ns: int) -> int:
+        """Until the next one: what is learnt at the beginning changes the verdict most."""
+        if self._first_ns is None:
+            self._first_ns = stamp_ns
+        age_ns = abs(stamp_ns - self._first_ns)
+        return min(max(age_ns, self._period_ns // SOONER), self._period_ns)
 
     def take(self) -> bool:
         """Whether an outcome has come in."""
@@ -69,9 +79,9 @@ class Audits:
         told = f"the model could not be tested against its own data for {waited_ns / S:.0f} s: {why}"
         return replace(last, passed=False, reasons=(*last.reasons, told))
 
-    def widening(self, point: str) -> float:
-        """Factor on the covariance of a point."""
-        return self._last.widening.get(point, 1.0)
+    def widening(self, name: str) -> float:
+        """Factor on the covariance of a point or pose."""
+        return self._last.widening.get(name, 1.0)
 
     def stop(self) -> None:
         """Ends what is under way."""

@@ -16,7 +16,7 @@ from ...frontends.fiducials.detector import MarkerFrontEnd
 from .settings import StreamSettings
 
 RECENT = 5
-"""Periods within which a board that was seen should still be in view: small markers are missed in one image of three."""
+"""Periods within which a board that was seen should still be in view: one image of three misses small markers."""
 SOONER = 4
 """A look that missed it is repeated so many times sooner."""
 

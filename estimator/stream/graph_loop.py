@@ -39,6 +39,10 @@ Float = NDArray[np.float64]
 PICTURES = 50
 """Cut-outs of clicks that are kept."""
 EVENTS = 50
+SETTLED_SIGMA = 0.3
+"""Standard deviations by which one more step may move an answer."""
+SETTLING = 2
+"""Steps of the solver for one answer: the next answer goes on."""
 
 
 class GraphLoop:
@@ -226,7 +230,7 @@ class GraphLoop:
         last = keys.keyframe(engine.odometry.last_keyframe)
         newest = [last] if state.has(last) else []
         try:
-            posterior = posterior_of(engine, newest)
+            posterior = self._settled(newest)
         except ObservabilityError:
             self.counts["undetermined"] += 1
             return None
@@ -247,11 +251,24 @@ class GraphLoop:
         self._forget_pictures()
         return replace(answer, decisions=self._decisions(answer, stamp_ns))
 
+    def _settled(self, newest: list[int]) -> Posterior:
+        """What the graph says now. A pipe and its points begin from rough guesses, and iSAM2 relinearises rarely: where
+        one Newton step more moves the answer, the solver goes on."""
+        engine = self.engine
+        posterior = posterior_of(engine, newest)
+        for _ in range(SETTLING):
+            if posterior.step_sigma < SETTLED_SIGMA:
+                break
+            engine.state.values = engine.solver.settle(1)
+            self.counts["settled"] += 1
+            posterior = posterior_of(engine, newest)
+        return posterior
+
     def _places(self, posterior: Posterior, newest: list[int]) -> dict[str, Place]:
         named = {board.id: self.engine.boards.key(board.id) for board in self.rig.boards}
         named = {"b": keys.base(0), **named, **({"m": newest[0]} if newest else {})}
         return {
-            name: Place(posterior.values.atPose3(key).matrix(), posterior.marginal(key))
+            name: Place(posterior.values.atPose3(key).matrix(), posterior.marginal(key) * self._audits.widening(name))
             for name, key in named.items()
             if key in posterior.columns
         }

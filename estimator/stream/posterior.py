@@ -40,6 +40,8 @@ class Posterior:
         """Shape (n, n)."""
         step = gtsam.VectorValues()
         delta = self.joint @ prior.g
+        self.step_sigma = float(np.abs(delta / np.sqrt(np.diag(self.joint))).max())
+        """The Newton step, in standard deviations of what moves most: how far from its optimum the estimate was."""
         for key, columns in self.columns.items():
             step.insert(key, delta[columns])
         self.values: gtsam.Values = prior.at.retract(step)
