@@ -201,6 +201,15 @@ class LinearSystem:
         """`R^T Y` of sensitivities Y to the whitened errors, (rows, m)."""
         return sensitivity if self.root is None else np.asarray(self.root.T @ sensitivity)
 
+    def spread(self, X: Float) -> Float:
+        """Covariance (m, m) of `X^T A^T e`, e the whitened errors, X of shape (n, m): as `influence`, in parts that do
+        not leave the caches."""
+        weighed = np.empty((len(self.b), X.shape[1]))
+        for start in range(0, X.shape[1], self._together):
+            part = slice(start, start + self._together)
+            weighed[:, part] = self.weigh(self.A @ np.ascontiguousarray(X[:, part]))
+        return weighed.T @ weighed
+
     def error_covariance(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Float:
         """Covariance (k, k) of the whitened errors of some rows (index or mask)."""
         root = (csr_matrix(identity(len(self.b))) if self.root is None else self.root)[rows]
