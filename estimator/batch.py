@@ -15,7 +15,7 @@ from .corner_variance import as_stated, corner_variance
 from .corner_variance import weights as corner_weights
 from .graph import FactorLog, Record
 from .linear import deviate
-from .linearised import Linearised, linearise, settled, with_correlated_tracks
+from .linearised import Linearised, linearise, relinearise, settled, with_correlated_tracks
 from .newton import ON_THE_WAY, Elimination, optimum, step_with
 from .observability import Undetermined
 from .odometry import FAMILY as ODOMETRY
@@ -98,7 +98,7 @@ def _without(
         if values is None:
             break
         before = float((at.norms[kept] ** 2).sum())
-        at = linearise(log, off, values, robust_sigma)
+        at = relinearise(at, kept, values, robust_sigma)
         after = float((at.norms**2).sum())
         if not after <= 1.01 * before:  # nor where it is no number
             break

@@ -62,9 +62,15 @@ class LinearSystem:
     `covariance` and `contributions` use the same A, so that contributions sum to the covariance exactly.
     """
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: NDArray[np.int64] | None = None
+    ) -> None:
+        """
+        Args:
+            rows: dimensions of the factors, where they are known already.
+        """
         self.linear = graph.linearize(values)
-        self.rows = np.array([graph.at(i).dim() for i in range(graph.size())])
+        self.rows = np.array([graph.at(i).dim() for i in range(graph.size())]) if rows is None else rows
         self.starts = np.concatenate([[0], np.cumsum(self.rows)])
         zero = values.zeroVectors()
         self.columns: dict[int, slice] = {}
