@@ -18,6 +18,7 @@ from ..frontends.fiducials.messages import sightings_from_messages
 from ..frontends.paper_chain import clicked_point
 from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early, StereoFrontEnd
+from ..frontends.stereo.settings import StereoSettings
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
 from .sides import swapped
@@ -109,7 +110,7 @@ class Sensors:
             left, right = self._camera("m_left"), self._camera("m_right")
             self._fits(left, pair.left, self.rig.cameras.m_left.image_topic)
             self._fits(right, pair.right, self.rig.cameras.m_right.image_topic)
-            self._stereo = StereoFrontEnd(left, right, self.left_T_right())
+            self._stereo = StereoFrontEnd(left, right, self.left_T_right(), self._stereo_settings())
             self._stereo.recall(self._atlas)
             self._atlas = Atlas()
         frame = self._stereo.process(pair.stamp_ns, pair.left, pair.right, wanted, early)
@@ -120,6 +121,13 @@ class Sensors:
     def memorable(self) -> Memorable | None:
         """What the last pair added to what can be found again."""
         return None if self._stereo is None else self._stereo.memorable
+
+    def _stereo_settings(self) -> StereoSettings:
+        cameras = (self.rig.cameras.m_left, self.rig.cameras.m_right)
+        return StereoSettings(
+            focal_sigma_rel=max(0.0 if "focal" in c.freeze else c.focal_sigma_rel for c in cameras),
+            centre_sigma_px=max(0.0 if "centre" in c.freeze else c.centre_sigma_px for c in cameras),
+        )
 
     def left_T_right(self) -> Float:
         """Nominal pose of the right mobile camera in the left one, (4, 4)."""

@@ -10,7 +10,9 @@ from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
 from ..batch import without_factors
+from ..board_inspection import FAMILY as CORNERS
 from ..consistency import family_tests, judge, prior_tests
+from ..corner_variance import corner_variance
 from ..engine import Engine
 from ..graph import FactorLog
 from ..linear import LinearSystem
@@ -60,15 +62,14 @@ def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, se
 
 def audit(engine: Engine) -> Audit:
     """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
-    mostly made of them, and cannot be told apart any more."""
+    mostly made of them, and cannot be told apart any more; corners by what their residuals show."""
     log = engine.solver.log
     values, off = relinearised(log, engine.solver.values())
     at = with_correlated_tracks(linearise(log, off, values, engine.rig.gates.robust_sigma), ODOMETRY)
     system = at.system
-    if system.root is not None:
-        earlier = np.array([record.family == FAMILY for _, _, record in at.active])
-        wider = np.where(np.repeat(earlier, system.rows), np.sqrt(at.inflation), 1.0)
-        system.root = csr_matrix(diags(wider) @ system.root)
+    variances = {FAMILY: at.inflation, CORNERS: corner_variance(at)}
+    wider = np.repeat([np.sqrt(variances.get(record.family, 1.0)) for _, _, record in at.active], system.rows)
+    system.root = csr_matrix(diags(wider) if system.root is None else diags(wider) @ system.root)
     families = tuple(f for f in family_tests(at) if f.family != FAMILY)
     consistency = judge(families, prior_tests(at.active, system, TESTED), {})
     return Audit(consistency, _widening(engine, at.system, values))

@@ -10,6 +10,7 @@ from ...factors.measurements import StereoFrame
 from ..undistort import undistort
 from . import points
 from .atlas import Atlas, Memorable, settled_tracks
+from .calibration_error import of_calibration
 from .detection import apart, detect
 from .expectation import expected_flow
 from .finding import FADING, Finding, Found
@@ -210,7 +211,7 @@ class StereoFrontEnd:
             tracks.points[usable],
             tracks.points_covariance[usable],
             px[usable],
-            covariance[usable],
+            covariance[usable] + self._of_calibration(tracks.points[usable], px[usable], guess),
             (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
@@ -225,6 +226,10 @@ class StereoFrontEnd:
         chi2 = np.full(len(tracks), np.nan)
         chi2[usable] = motion.chi2
         return Motion(motion.reference_T_this, inliers, chi2)
+
+    def _of_calibration(self, points: Float, px: Float, guess: Float) -> Float:
+        sigmas = self.settings.focal_sigma_rel, self.settings.centre_sigma_px
+        return of_calibration(points, px, guess, self.rig, *sigmas)
 
     def _wants_keyframe(self, left_px: Float, pose: Float) -> str | None:
         flow = left_px - self._tracks.keyframe_px

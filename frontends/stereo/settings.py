@@ -37,6 +37,9 @@ class StereoSettings:
     """Absolute number of tracks below which a moving camera makes a new keyframe."""
     still_px: float = 1.0
     """Median flow below which the camera counts as standing still."""
+    focal_sigma_rel: float = 0.003
+    """How well the cameras' calibration is known: tracks may miss a motion by what it adds."""
+    centre_sigma_px: float = 1.0
     min_inliers: int = 12
     min_spread: float = 0.03
     """Smallest standard deviation of the inliers, in the direction of least spread, as a share of the diagonal."""
