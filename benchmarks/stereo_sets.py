@@ -8,9 +8,9 @@ import time
 
 import gtsam
 
-from surecut.estimator.batch import optimum
 from surecut.estimator.graph import FactorLog, Update
 from surecut.estimator.incremental import Incremental
+from surecut.estimator.newton import optimum
 from surecut.factors.errors import SurecutError
 from surecut.simulation.stereo_sets import SETS, load, updates
 

@@ -52,8 +52,8 @@ class Joint:
         """The joint of some variables of the graph as it is."""
         columns, X = _solved(system, keys)
         selected = np.concatenate([np.arange(system.parameters)[system.columns[key]] for key in keys])
-        weight, influence = X[selected], system.weigh(system.A @ X)
-        return cls(columns, 0.5 * (weight + weight.T), influence.T @ influence)
+        weight = X[selected]
+        return cls(columns, 0.5 * (weight + weight.T), system.spread(X))
 
     def after(self, rows: Rows, blocks: Blocks) -> Float:
         """Covariance of `J x` after further measurements.
@@ -142,7 +142,6 @@ def measured_again(system: LinearSystem, rows: NDArray[np.bool_], times: float, 
     W = np.sqrt(times - 1.0) * system.A[rows].toarray()
     right = np.hstack([J, W.T])
     X = system.solve(right)
-    influence = system.weigh(system.A @ X)
-    joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, influence.T @ influence)
+    joint = Joint({0: slice(0, right.shape[1])}, right.T @ X, system.spread(X))
     select = np.hstack([np.zeros((len(W), J.shape[1])), np.eye(len(W))])
     return joint.after(Rows(select, system.error_covariance(rows)), [(0, np.eye(J.shape[1], right.shape[1]))])

@@ -38,6 +38,8 @@ KINDS = tuple(product(PERSISTENCE, (False, True)))
 """Persistence, and whether left and right image share the error."""
 DRAWS = 6
 """Draws per kind: each holds some ten thousand residuals."""
+ENTRIES = 4_000_000
+"""Of errors that are drawn at once: 32 MB."""
 RANGE = 0.14
 """Distance over which errors of neighbours are alike, as a share of the image's diagonal."""
 NEAR = (0.0, 0.07, 0.14, 0.28)
@@ -125,11 +127,10 @@ def _group_effect(
     worse of the two accounts counts, and `least` at least.
     """
     errors = found @ np.random.default_rng(1).normal(size=(len(system.b), DRAWS))
-    residuals = np.column_stack([system.b, errors - system.A @ system.solve(system.A.T @ errors)])
-    seen = tracks.gather(system, residuals)
-    own = (tracks.gather(system, influence)[:, :, :, None] * seen[..., None]).sum(axis=(1, 2))
-    whole = np.zeros((int(tracks.track.max()) + 1, *own.shape[1:]))
-    np.add.at(whole, tracks.track, own)
+    residuals = np.column_stack([system.b, system.residuals_of(errors)])
+    seen = tracks.gather(system, residuals).reshape(len(tracks.track), 4, -1)
+    own = seen.transpose(0, 2, 1) @ tracks.gather(system, influence).reshape(len(tracks.track), 4, -1)
+    whole = _summed(own, tracks.track)
     ratios = [_contributed(whole)]
     ratios.append(float(np.mean([_contributed(_summed(whole, group)) for group in _parts(tracks, values)])))
     return max(*ratios, least)
@@ -142,9 +143,9 @@ def _contributed(groups: Float) -> float:
 
 
 def _summed(whole: Float, group: Int) -> Float:
-    total = np.zeros((int(group.max()) + 1, *whole.shape[1:]))
-    np.add.at(total, group, whole)
-    return total
+    """Sums over the members of each group, of which there are 0, 1, ..."""
+    order = np.argsort(group, kind="stable")
+    return np.add.reduceat(whole[order], np.flatnonzero(np.r_[True, np.diff(group[order]) > 0]))
 
 
 def _parts(tracks: "Tracks", values: gtsam.Values) -> list[Int]:
@@ -223,17 +224,20 @@ def components(tracks: "Tracks", system: LinearSystem) -> Float:
     """
     rng = np.random.default_rng(0)
     seen, counts = tracks.products(tracks.gather(system, system.b[:, None]))
-    expected = []
     drawn = [tracks.draw(rho, shared, DRAWS, rng) for rho, shared in KINDS]
-    for errors in (*drawn, tracks.draw_neighbours(DRAWS, rng)):
-        whole = np.zeros((len(system.b), DRAWS))
+    drawn.append(tracks.draw_neighbours(DRAWS, rng))
+    together = max(1, ENTRIES // (4 * DRAWS * len(tracks.track)))
+    expected = []
+    for start in range(0, len(drawn), together):
+        errors = np.concatenate(drawn[start : start + together], axis=-1)
+        whole = np.zeros((len(system.b), errors.shape[-1]))
         for camera in range(2):
             whole[tracks.rows(system, camera)] = errors[tracks.seen[:, camera], camera]
-        residuals = whole - system.A @ system.solve(system.A.T @ whole)
-        expected.append(tracks.products(tracks.gather(system, residuals))[0])
+        products = tracks.products(tracks.gather(system, system.residuals_of(whole)))[0]
+        expected.append(products.reshape(len(counts), 2, -1, DRAWS).mean(axis=-1))
     weight = np.sqrt(counts)
-    design = np.stack(expected, axis=-1) * weight[:, None, None]
-    return np.stack([nnls(design[:, axis], seen[:, axis] * weight)[0] for axis in range(2)], axis=1)
+    design = np.concatenate(expected, axis=-1) * weight[:, None, None]
+    return np.stack([nnls(design[:, axis], seen[:, axis, 0] * weight)[0] for axis in range(2)], axis=1)
 
 
 class Tracks:
@@ -299,7 +303,7 @@ class Tracks:
         """Mean products of residuals (n, camera, axis, k) of one track, and of how many.
 
         Returns:
-            shape (s, axis) and (s,): 0, 1, ... keyframes apart in one camera, then in different cameras; then
+            shape (s, axis, k) and (s,): 0, 1, ... keyframes apart in one camera, then in different cameras; then
             neighbours in one image.
         """
         means, counts = [], []
@@ -309,7 +313,7 @@ class Tracks:
                 late, seen = (own[lag:, ::-1], self.seen[lag:, ::-1]) if other else (own[lag:], self.seen[lag:])
                 both = (self.track[lag:] == self.track[:last])[:, None] & seen & self.seen[:last]
                 counts.append(max(int(both.sum()), 1))
-                means.append((late * own[:last]).sum(axis=(0, 1)).mean(axis=-1) / counts[-1] if both.any() else [0, 0])
+                means.append(np.einsum("icak,icak->ak", late, own[:last]) / counts[-1])
         for low, high in pairwise(NEAR):
             total, count = self._neighbours(own, low, high)
             means.append(total / max(count, 1))
@@ -317,13 +321,13 @@ class Tracks:
         return np.array(means, dtype=np.float64), np.array(counts, dtype=np.float64)
 
     def _neighbours(self, own: Float, low: float, high: float) -> tuple[Float, int]:
-        """Sum (axis,) over pairs of one image that are so far apart, and their number."""
-        total, count = np.zeros(2), 0
+        """Sum (axis, k) over pairs of one image that are so far apart, and their number."""
+        total, count = np.zeros(own.shape[2:]), 0
         for image, apart in zip(self.images, self._apart, strict=True):
             near = ((apart > low) & (apart <= high)).astype(np.float64)
             values = own[image]
             others = (near @ values.reshape(len(image), -1)).reshape(values.shape)
-            total += (others * values).sum(axis=(0, 1)).mean(axis=-1)
+            total += (others * values).sum(axis=(0, 1))
             seen = self.seen[image].astype(np.float64)
             count += int((near @ seen * seen).sum())
         return total, count

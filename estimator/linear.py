@@ -9,18 +9,19 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, diags, identity, vstack
+from scipy.sparse import block_diag, csr_matrix, diags, identity, vstack
 
 from ..factors.chance import chi2_sf, normal_isf
 from .normal_equations import NormalEquations
 
 Float = NDArray[np.float64]
+Blocks = Sequence[tuple[int, Float]]
 
 DETERMINED = 1e-3
 """A residual direction with less than this share of its own variance left is determined by its own measurement."""
 
-CHUNK = 384
-"""Right-hand sides that are solved together, at most."""
+CHUNK = 64
+"""Right-hand sides that are solved together, at most: more of them only fill the caches."""
 CHUNK_ENTRIES = 8_000_000
 """... and entries (rows of the system times right-hand sides): 64 MB, however long the recording."""
 
@@ -61,48 +62,52 @@ class LinearSystem:
     `covariance` and `contributions` use the same A, so that contributions sum to the covariance exactly.
     """
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        linear = graph.linearize(values)
-        self.rows = np.array([graph.at(i).dim() for i in range(graph.size())])
+    def __init__(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, rows: NDArray[np.int64] | None = None
+    ) -> None:
+        """
+        Args:
+            rows: dimensions of the factors, where they are known already.
+        """
+        self.linear = graph.linearize(values)
+        self.rows = np.array([graph.at(i).dim() for i in range(graph.size())]) if rows is None else rows
         self.starts = np.concatenate([[0], np.cumsum(self.rows)])
-        entries = np.asarray(linear.sparseJacobian_())
-        keys = list(linear.keyVector())
         zero = values.zeroVectors()
         self.columns: dict[int, slice] = {}
         column = 0
-        for key in sorted(keys):
+        for key in sorted(self.linear.keyVector()):
             size = zero.at(key).size
             self.columns[key] = slice(column, column + size)
             column += size
-        i, j = entries[0].astype(int) - 1, entries[1].astype(int) - 1
-        shape = (int(self.starts[-1]), column)
-        keep = j < column
-        self.A = csr_matrix((entries[2][keep], (i[keep], j[keep])), shape=shape)
-        self.b = np.zeros(shape[0])
-        self.b[i[~keep]] = entries[2][~keep]
         self._columns = column
+        self._entries = np.asarray(self.linear.sparseJacobian_())
+        right = np.flatnonzero(self._entries[1] > column)
+        self.b = np.zeros(int(self.starts[-1]))
+        self.b[self._entries[0, right].astype(np.int32) - 1] = self._entries[2, right]
         self.root: csr_matrix | None = None
         """Shape (rows, rows): times its transpose the covariance of the whitened errors, where they are correlated;
         None for the identity."""
 
     @cached_property
+    def A(self) -> csr_matrix:
+        """Shape (rows, parameters). Residuals alone do without."""
+        i, j, data = self._entries
+        left = j <= self._columns
+        place = i[left].astype(np.int32) - 1, j[left].astype(np.int32) - 1
+        return csr_matrix((data[left], place), shape=(len(self.b), self._columns))
+
+    @cached_property
     def _normal(self) -> NormalEquations:
         """Only covariances need it, residuals do not."""
-        return NormalEquations(csr_matrix(self.A.T @ self.A), self.columns)
+        return NormalEquations(self._information, self.columns)
+
+    @cached_property
+    def _information(self) -> csr_matrix:
+        return csr_matrix(self.A.T @ self.A)
 
     @property
     def parameters(self) -> int:
         return self._columns
-
-    def touching(self, keys: Sequence[int]) -> list[list[int]]:
-        """Positions of the factors that each variable is in."""
-        by_column = csc_matrix(self.A)
-        found = []
-        for key in keys:
-            column = self.columns[key]
-            rows = by_column.indices[by_column.indptr[column.start] : by_column.indptr[column.stop]]
-            found.append(np.unique(np.searchsorted(self.starts, rows, side="right") - 1).tolist())
-        return found
 
     @property
     def _together(self) -> int:
@@ -113,33 +118,84 @@ class LinearSystem:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
         return self._normal.solve(right)
 
+    def residuals_of(self, errors: Float) -> Float:
+        """What the adjustment leaves of errors of the measurements, both (rows, k)."""
+        left = np.empty_like(errors)
+        for start in range(0, errors.shape[1], self._together):
+            part = errors[:, start : start + self._together]
+            left[:, start : start + self._together] = part - self.A @ self.solve(self.A.T @ part)
+        return left
+
     def rest_covariance(self) -> tuple[NDArray[np.int64], Float | None]:
         """Place (n,) of every unknown among those that are no landmark, -1 for landmarks, and the covariance of those;
         None where they are too many."""
         return self._normal.rest_inverse()
 
-    def weighed_rows(self, root_weight: Float) -> "LinearSystem":
-        """The system of the same factors with other weights, at its own solution.
+    def settled(self) -> "tuple[LinearSystem, Float, float]":
+        """The same with the residuals of its solution, the step (n,) to there, and its gain of half the squares."""
+        pull = self.A.T @ self.b
+        step = self.solve(pull[:, None])[:, 0]
+        other = copy(self)
+        other.b = self.b - self.A @ step
+        return other, step, 0.5 * float(pull @ step)
+
+    def moved(self, values: gtsam.Values, step: Float) -> gtsam.Values:
+        """The estimate a step (n,) on."""
+        delta = gtsam.VectorValues()
+        for key, columns in self.columns.items():
+            delta.insert(key, step[columns])
+        return values.retract(delta)
+
+    def weighed_rows(self, root_weight: Float) -> "tuple[LinearSystem, Float]":
+        """The system of the same factors with other weights, at its own solution, and the step (n,) to there.
 
         Args:
             root_weight: shape (rows,), one over the factors of the rows' standard deviations.
         """
-        other = copy(self)
-        other.__dict__.pop("_normal", None)
-        other.root = None
-        other.A = csr_matrix(diags(root_weight) @ self.A)
-        other.b = root_weight * self.b
-        other.b = other.b - other.A @ other.solve((other.A.T @ other.b)[:, None])[:, 0]
+        return self._other(csr_matrix(diags(root_weight) @ self.A), root_weight * self.b).settled()[:2]
+
+    def exchanged(
+        self, removed: Sequence[int], graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+    ) -> "LinearSystem":
+        """The system with other factors of the same variables in the place of some; their errors are independent.
+
+        Args:
+            removed: positions of factors.
+            graph: the new ones, which come after those that stay.
+            values: where they are linearised; the others stay as they are.
+        """
+        new = LinearSystem(graph, values)
+        place = np.concatenate([np.arange(self.parameters)[self.columns[key]] for key in new.columns])
+        J = new.A.tocoo()
+        J = csr_matrix((J.data, (J.row, place[J.col])), shape=(len(new.b), self.parameters))
+        stays = np.ones(len(self.rows), bool)
+        stays[removed] = False
+        rows = np.repeat(stays, self.rows)
+        other = self._other(csr_matrix(vstack([self.A[rows], J])), np.concatenate([self.b[rows], new.b]))
+        gone = self.A[~rows]
+        other._information = csr_matrix(self._information - gone.T @ gone + J.T @ J)
+        other.rows = np.concatenate([self.rows[stays], new.rows])
+        other.starts = np.concatenate([[0], np.cumsum(other.rows)])
+        if self.root is not None:
+            other.root = csr_matrix(block_diag((self.root[rows][:, rows], identity(len(new.b)))))
         return other
 
-    def selector(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def _other(self, A: csr_matrix, b: Float) -> "LinearSystem":
+        """Of the same variables."""
+        other = copy(self)
+        for cached in ("_normal", "_information"):
+            other.__dict__.pop(cached, None)
+        other.A, other.b, other.root = A, b, None
+        return other
+
+    def selector(self, blocks: Blocks) -> Float:
         """A Jacobian over all variables from blocks (key, J of shape (m, dim)); returns its transpose (n, m)."""
         full = np.zeros((self.parameters, blocks[0][1].shape[0]))
         for key, J in blocks:
             full[self.columns[key]] += J.T
         return full
 
-    def influence(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def influence(self, blocks: Blocks) -> Float:
         """`R^T A (A^T A)^-1 J^T`, shape (rows, m), R R^T the errors' covariance: its squares are the contributions.
 
         With R = 1 they sum to `J (A^T A)^-1 J^T`, else to the covariance of the same estimate under the errors as they
@@ -151,12 +207,21 @@ class LinearSystem:
         """`R^T Y` of sensitivities Y to the whitened errors, (rows, m)."""
         return sensitivity if self.root is None else np.asarray(self.root.T @ sensitivity)
 
+    def spread(self, X: Float) -> Float:
+        """Covariance (m, m) of `X^T A^T e`, e the whitened errors, X of shape (n, m): as `influence`, in parts that do
+        not leave the caches."""
+        weighed = np.empty((len(self.b), X.shape[1]))
+        for start in range(0, X.shape[1], self._together):
+            part = slice(start, start + self._together)
+            weighed[:, part] = self.weigh(self.A @ np.ascontiguousarray(X[:, part]))
+        return weighed.T @ weighed
+
     def error_covariance(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Float:
         """Covariance (k, k) of the whitened errors of some rows (index or mask)."""
         root = (csr_matrix(identity(len(self.b))) if self.root is None else self.root)[rows]
         return np.asarray((root @ root.T).todense())
 
-    def covariance(self, blocks: Sequence[tuple[int, Float]]) -> Float:
+    def covariance(self, blocks: Blocks) -> Float:
         """Covariance of `J x`, shape (m, m)."""
         influence = self.influence(blocks)
         return influence.T @ influence
@@ -170,17 +235,20 @@ class LinearSystem:
 
     def marginals(self, keys: Sequence[int]) -> list[Float]:
         """Each variable's own covariance."""
+        if self.root is not None:
+            return self.covariances([[(k, np.eye(self.columns[k].stop - self.columns[k].start))] for k in keys])
         found = []
         for chunk in _chunks([self.columns[k].stop - self.columns[k].start for k in keys], self._together):
-            columns = [self.columns[keys[i]] for i in chunk]
-            if self.root is None:
-                found += self._normal.inverse_blocks(columns)
-                continue
-            right = np.zeros((self.parameters, sum(c.stop - c.start for c in columns)))
-            at = np.concatenate([[0], np.cumsum([c.stop - c.start for c in columns])])
-            for column, (start, stop) in zip(columns, pairwise(at), strict=True):
-                right[column, start:stop] = np.eye(stop - start)
-            influence = self.weigh(self.A @ self.solve(right))
+            found += self._normal.inverse_blocks([self.columns[keys[i]] for i in chunk])
+        return found
+
+    def covariances(self, of: Sequence[Blocks]) -> list[Float]:
+        """Covariance of each of several `J x` alone, given by blocks (key, J of shape (m, dim))."""
+        found = []
+        for chunk in _chunks([blocks[0][1].shape[0] for blocks in of], self._together):
+            right = [self.selector(of[i]) for i in chunk]
+            influence = self.weigh(self.A @ self.solve(np.hstack(right)))
+            at = np.concatenate([[0], np.cumsum([r.shape[1] for r in right])])
             found += [influence[:, a:b].T @ influence[:, a:b] for a, b in pairwise(at)]
         return found
 

@@ -1,7 +1,7 @@
 """All factors at an estimate: where they come from, the linear system that they make, and their residuals."""
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -23,6 +23,8 @@ class Linearised:
     values: gtsam.Values
     active: Active
     system: LinearSystem
+    rejectable: NDArray[np.bool_]
+    """(factors,), what may be thrown out and is softened by a Huber loss."""
     norms: Float
     """(factors,), norm of each whitened residual, the robust loss undone."""
     inflation: float = 1.0
@@ -35,16 +37,42 @@ class Linearised:
             graph.add(factor)
         return graph
 
+    def touching(self, variables: Sequence[int]) -> list[list[int]]:
+        """Positions of the factors that each variable is in."""
+        found: dict[int, list[int]] = {key: [] for key in variables}
+        for position, (_, factor, _) in enumerate(self.active):
+            for key in factor.keys():
+                if key in found:
+                    found[key].append(position)
+        return list(found.values())
+
 
 def linearise(log: FactorLog, off: Collection[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
     """The factors of a log, without those that are off, at an estimate."""
     active = [row for row in log.active() if row[0] not in off]
+    rows = np.array([factor.dim() for _, factor, _ in active])
+    rejectable = np.array([record.rejectable for _, _, record in active])
+    return _linearised(active, rows, rejectable, values, robust_sigma)
+
+
+def relinearise(at: Linearised, kept: Sequence[int], values: gtsam.Values, robust_sigma: float) -> Linearised:
+    """Some of the factors at another estimate.
+
+    Args:
+        kept: their positions.
+    """
+    active = [at.active[p] for p in kept]
+    return _linearised(active, at.system.rows[kept], at.rejectable[kept], values, robust_sigma)
+
+
+def _linearised(
+    active: Active, rows: NDArray[np.int64], rejectable: NDArray[np.bool_], values: gtsam.Values, robust_sigma: float
+) -> Linearised:
     graph = gtsam.NonlinearFactorGraph()
     for _, factor, _ in active:
         graph.add(factor)
-    system = LinearSystem(graph, values)
-    rejectable = np.array([record.rejectable for _, _, record in active])
-    return Linearised(values, active, system, residual_norms(system, rejectable, robust_sigma))
+    system = LinearSystem(graph, values, rows)
+    return Linearised(values, active, system, rejectable, residual_norms(system, rejectable, robust_sigma))
 
 
 def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_sigma: float) -> Float:
@@ -56,6 +84,17 @@ def residual_norms(system: LinearSystem, rejectable: NDArray[np.bool_], robust_s
     scale = np.array([robust_scale(robust_sigma, int(n)) for n in range(1, int(system.rows.max()) + 1)])
     scale = scale[system.rows - 1]
     return np.where(rejectable & (softened > scale), softened**2 / scale, softened)
+
+
+def settled(at: Linearised, robust_sigma: float) -> tuple[Linearised, float]:
+    """One Gauss-Newton step on, nothing linearised anew; and what the step gains of half the chi-square.
+
+    Raises:
+        Undetermined: a variable.
+    """
+    system, step, gain = at.system.settled()
+    norms = residual_norms(system, at.rejectable, robust_sigma)
+    return replace(at, values=system.moved(at.values, step), system=system, norms=norms), gain
 
 
 def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> Linearised:
@@ -72,4 +111,4 @@ def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> L
     own = csr_matrix(diags(np.where(mine, np.sqrt(slack) if found is None else slack, 1.0)))
     at.system.root = own if found is None else csr_matrix(own @ found.root)
     inflation = slack if found is None else found.inflation * slack**2
-    return Linearised(at.values, at.active, at.system, at.norms, inflation)
+    return replace(at, inflation=inflation)

@@ -21,6 +21,8 @@ MOST = 60
 def motions(values: gtsam.Values, system: LinearSystem, stamps_ns: Sequence[int]) -> tuple[MotionEstimate, ...]:
     """Motions between keyframes that are a second apart or a little more, one after the other.
 
+    Their covariances are from the joint of both poses: errors that they share cancel in the motion between them.
+
     Args:
         values: the estimate.
         system: its linear system.
@@ -29,7 +31,14 @@ def motions(values: gtsam.Values, system: LinearSystem, stamps_ns: Sequence[int]
     pairs = windows(stamps_ns)
     if len(pairs) > MOST:
         pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, MOST).round().astype(int)]
-    return tuple(_motion(values, system, stamps_ns, first, last) for first, last in pairs)
+    ends = [(keys.keyframe(first), keys.keyframe(last)) for first, last in pairs]
+    covariances = system.covariances([motion_blocks(values, before, after) for before, after in ends])
+    found = []
+    for (first, last), (before, after), covariance in zip(pairs, ends, covariances, strict=True):
+        motion = values.atPose3(before).between(values.atPose3(after))
+        covariance = ros_covariance(motion, covariance)
+        found.append(MotionEstimate(stamps_ns[first], stamps_ns[last], motion.matrix(), covariance))
+    return tuple(found)
 
 
 def windows(stamps_ns: Sequence[int]) -> list[tuple[int, int]]:
@@ -41,16 +50,6 @@ def windows(stamps_ns: Sequence[int]) -> list[tuple[int, int]]:
             found.append((order[first], order[last]))
             first = last
     return found
-
-
-def _motion(
-    values: gtsam.Values, system: LinearSystem, stamps_ns: Sequence[int], first: int, last: int
-) -> MotionEstimate:
-    """The joint of both poses: errors that they share cancel in the motion between them."""
-    before, after = keys.keyframe(first), keys.keyframe(last)
-    motion = values.atPose3(before).between(values.atPose3(after))
-    covariance = ros_covariance(motion, system.covariance(motion_blocks(values, before, after)))
-    return MotionEstimate(stamps_ns[first], stamps_ns[last], motion.matrix(), covariance)
 
 
 def motion_blocks(values: gtsam.Values, before: int, after: int) -> list[tuple[int, Float]]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_diag, csr_matrix, identity
 
 from ..factors.calibration import depth_sigmas
 from ..factors.cloud import plane_factor
@@ -29,6 +28,8 @@ from .surfaces import SAME_SIDE_COSINE
 
 Float = NDArray[np.float64]
 
+OTHER_WAYS = ("mount", CLOUD, CYLINDER)
+"""Families that place {b}, by the mount or by landmarks on other surfaces than those that are near now."""
 SAME_PIPE_SIGMA = 4.0
 WEAK_SIGMA = 0.3
 """Sigma of {b} (rad, or m) beyond which the cloud tells nothing about a mount in that direction."""
@@ -125,16 +126,17 @@ def _test_from(
     start = gtsam.Values(values)
     start.update(base, o_T_b)
     planes = _planes(found, cloud, base, start, engine.rig.gates.robust_sigma)
-    kept = [i for i, (_, _, record) in enumerate(active) if record.family not in ("mount", CLOUD, CYLINDER)]
-    root = _root_of(system, kept)
-    factors = [active[i][1] for i in kept] + planes
+    at_base = [
+        i for i, (_, factor, record) in enumerate(active) if record.family in OTHER_WAYS or base in factor.keys()
+    ]
+    factors = [active[i][1] for i in at_base if active[i][2].family not in OTHER_WAYS] + planes
     factors.append(weak_pose_prior(base, start.atPose3(base), 1.0, 1.0))
-    without = _system(factors, start, root)
-    solved = _solved(without, start)
+    without, solved = _solved(system.exchanged(at_base, _graph(factors), start), start)
     pipes = [seen for seen in engine.depth_pipes.seen.values() if _fits(seen, without, solved)]
     if pipes:
-        without = _system(factors + [seen.factor() for seen in pipes], solved, root)
-        solved = _solved(without, solved)
+        last = range(len(without.rows) - len(factors), len(without.rows))
+        factors += [seen.factor() for seen in pipes]
+        without, solved = _solved(without.exchanged(last, _graph(factors), solved), solved)
     unit = gtsam.BetweenFactorPose3(engine.boards.key(mount.board), base, mount_pose(mount), pose_sigmas(1.0, 1.0))
     linear = unit.linearize(solved)
     J, residual = linear.jacobian()
@@ -187,24 +189,11 @@ def held_part(residual: Float, spread: Float, own: Float) -> HeldPart | None:
     return HeldPart(total, basis.shape[1], basis @ part, basis @ covariance @ basis.T)
 
 
-def _root_of(system: LinearSystem, kept: list[int]) -> csr_matrix | None:
-    """The part of the errors' correlation that belongs to some factors."""
-    if system.root is None:
-        return None
-    rows = np.concatenate([np.arange(system.starts[i], system.starts[i + 1]) for i in kept])
-    return csr_matrix(system.root[rows][:, rows])
-
-
-def _system(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, root: csr_matrix | None) -> LinearSystem:
-    """The linear system of factors, the first rows' errors as correlated as in the full one."""
+def _graph(factors: list[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
-    system = LinearSystem(graph, values)
-    if root is not None:
-        rest = len(system.b) - root.indptr.size + 1
-        system.root = csr_matrix(block_diag((root, identity(rest))))
-    return system
+    return graph
 
 
 def _fits(seen: SeenCylinder, system: LinearSystem, values: gtsam.Values) -> bool:
@@ -213,13 +202,10 @@ def _fits(seen: SeenCylinder, system: LinearSystem, values: gtsam.Values) -> boo
     return test.sigma < SAME_PIPE_SIGMA
 
 
-def _solved(system: LinearSystem, start: gtsam.Values) -> gtsam.Values:
+def _solved(system: LinearSystem, start: gtsam.Values) -> tuple[LinearSystem, gtsam.Values]:
     """One Gauss-Newton step: {b} has moved most of the way by the registration already."""
-    step = system.solve((system.A.T @ system.b)[:, None])[:, 0]
-    delta = gtsam.VectorValues()
-    for key, columns in system.columns.items():
-        delta.insert(key, step[columns])
-    return start.retract(delta)
+    settled, step, _ = system.settled()
+    return settled, system.moved(start, step)
 
 
 def _planes(

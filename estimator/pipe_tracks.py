@@ -32,9 +32,8 @@ def leave_out_pipe_tracks(engine: Engine) -> None:
     seen_in: dict[int, set[int]] = defaultdict(set)
     for _, factor, record in engine.solver.log.active():
         if record.family == FAMILY and record.camera is not None:
-            by_kind = {keys.kind(key): key for key in factor.keys()}
-            if "l" in by_kind and "x" in by_kind:
-                seen_in[by_kind["l"]].add(by_kind["x"])
+            involved = factor.keys()  # the pose first
+            seen_in[keys.landmark_among(involved)].add(involved[0])
     left = Counter(keyframe for landmark, seen in seen_in.items() if landmark not in near for keyframe in seen)
     gone = {landmark: radii for landmark, radii in near.items() if all(left[k] >= ENOUGH for k in seen_in[landmark])}
     engine.state.values = engine.solver.leave_out(gone)

@@ -34,7 +34,6 @@ from .result import (
     Advice,
     Consistency,
     DistanceEstimate,
-    MotionEstimate,
     PickView,
     PipeEstimate,
     PointEstimate,
@@ -47,6 +46,8 @@ from .trajectory import trajectory
 Float = NDArray[np.float64]
 LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "pipe width", "picks")
 """Families without each of which there may still be an estimate to compare with."""
+MANY = "lxq"
+"""Kinds of variables of which there are many: landmarks, keyframes, corners."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +57,6 @@ class _Rest:
     trajectory: tuple[PoseEstimate, ...]
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
-    motions: tuple[MotionEstimate, ...]
-    streaming_difference_sigma: dict[str, float]
-    memory: str
 
 
 class Summary:
@@ -74,6 +72,7 @@ class Summary:
         self._values = solution.values
         self._solution = solution
         self._active, self._system = solution.at.active, solution.at.system
+        self._known_sigmas: dict[int, Float] = {}
 
     def result(
         self,
@@ -92,13 +91,16 @@ class Summary:
         around = surroundings(engine, self._values, self._system)
         points = tuple(self._with_surface(p, pipes, around) for p in points)
         rest: Aside[_Rest] = Aside(self._apart, niceness=0)
-        rest.begin(lambda: self._rest(points, memory))
+        rest.begin(lambda: self._rest(points))
         try:
             consistency = self._consistency()
             distances = self._distances(between)
             self._tell_corner_rms()
             poses = self._poses()
             calibration = calibration_rows(engine, self._values, self._sigmas)
+            moved = motions(self._values, self._system, engine.odometry.keyframe_stamps)
+            streaming = self._streaming_difference()
+            remembered = memory()
             other = rest.awaited()
         finally:
             rest.stop()
@@ -112,7 +114,7 @@ class Summary:
             consistency=consistency,
             rejected=(*everything_rejected(engine), *self._solution.rejected),
             events=tuple(sorted(engine.everything_told(), key=lambda e: e.stamp_ns)),
-            streaming_difference_sigma=other.streaming_difference_sigma,
+            streaming_difference_sigma=streaming,
             timing=timing,
             provenance=provenance,
             config_yaml=dump_rig(engine.rig),
@@ -122,19 +124,16 @@ class Summary:
             pick_views=other.pick_views,
             picks=pick_records(engine),
             surroundings=compact_map(around),
-            motions=other.motions,
-            memory=other.memory,
+            motions=moved,
+            memory=remembered,
         )
 
-    def _rest(self, points: tuple[PointEstimate, ...], memory: Callable[[], str]) -> "_Rest":
-        """What changes nothing and is told to nobody before the end."""
+    def _rest(self, points: tuple[PointEstimate, ...]) -> "_Rest":
+        """Half of the work, of what changes nothing and is told to nobody before the end."""
         return _Rest(
             trajectory(self._engine.odometry, self._values, self._keyframe_covariances()),
             self._advice(points),
             pick_views(self._engine, self._values, self._system),
-            motions(self._values, self._system, self._engine.odometry.keyframe_stamps),
-            self._streaming_difference(),
-            memory(),
         )
 
     def _advice(self, points: tuple[PointEstimate, ...]) -> dict[str, tuple[Advice, ...]]:
@@ -199,12 +198,18 @@ class Summary:
     def _budget(self, influence: Float) -> dict[str, Float]:
         """Share of every source in a covariance: with A the whitened Jacobian, J (A^T A)^-1 J^T is the sum over the
         rows of A of (J (A^T A)^-1 a_i)^2, so the sources' shares sum to it exactly."""
-        shares: dict[str, Float] = {}
-        for position, (_, _, record) in enumerate(self._active):
-            rows = influence[self._system.starts[position] : self._system.starts[position + 1]]
-            name = f"{record.family}: {record.source}" if record.source != record.family else record.family
-            shares[name] = shares.get(name, np.zeros((3, 3))) + rows.T @ rows
-        return dict(sorted(shares.items(), key=lambda item: -float(np.trace(item[1]))))
+        names, group = self._sources()
+        products = influence[:, :, None] * influence[:, None, :]
+        shares = np.stack([np.bincount(group, p, len(names)) for p in products.reshape(len(group), -1).T], axis=-1)
+        order = np.argsort(-np.trace(shares.reshape(-1, 3, 3), axis1=1, axis2=2), kind="stable")
+        return {names[i]: np.asarray(shares[i].reshape(3, 3), np.float64) for i in order}
+
+    def _sources(self) -> tuple[list[str], NDArray[np.int64]]:
+        """Names of what the rows of the system come from, and which one each row (rows,) does."""
+        place: dict[tuple[str, str], int] = {}
+        group = [place.setdefault((r.family, r.source), len(place)) for _, _, r in self._active]
+        names = [f"{family}: {source}" if source != family else family for family, source in place]
+        return names, np.repeat(group, self._system.rows)
 
     def _pipes(self, points: tuple[PointEstimate, ...]) -> tuple[PipeEstimate, ...]:
         found = []
@@ -242,12 +247,12 @@ class Summary:
         last = engine.odometry.last_keyframe
         if last >= 0:
             named.append(("m", keys.keyframe(last), engine.odometry.keyframe_stamps[last]))
-        return tuple(self._pose(name, key, stamp) for name, key, stamp in named)
-
-    def _pose(self, name: str, key: int, stamp_ns: int) -> PoseEstimate:
-        pose = self._values.atPose3(key)
-        covariance = ros_covariance(pose, self._system.joint([key]))
-        return PoseEstimate(name, "o", stamp_ns, pose.matrix(), covariance)
+        found = []
+        covariances = self._system.marginals([key for _, key, _ in named])
+        for (name, key, stamp_ns), covariance in zip(named, covariances, strict=True):
+            pose = self._values.atPose3(key)
+            found.append(PoseEstimate(name, "o", stamp_ns, pose.matrix(), ros_covariance(pose, covariance)))
+        return tuple(found)
 
     def _keyframe_covariances(self) -> list[Float]:
         """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
@@ -258,7 +263,11 @@ class Summary:
 
     def _sigmas(self, key: int) -> Float:
         """Standard deviations of one variable's components."""
-        return np.sqrt(np.clip(np.diag(self._system.joint([key])), 0.0, None))
+        if key not in self._known_sigmas:  # then of all calibration and the like, which is hardly more work
+            few = [k for k in self._system.columns if k == key or keys.kind(k) not in MANY]
+            for k, covariance in zip(few, self._system.marginals(few), strict=True):
+                self._known_sigmas[k] = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        return self._known_sigmas[key]
 
     def _distances(self, between: tuple[tuple[str, str], ...]) -> tuple[DistanceEstimate, ...]:
         rig = self._engine.rig

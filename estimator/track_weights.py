@@ -35,6 +35,8 @@ LANDMARK = 3
 """Coordinates of a point."""
 LIGHT = 0.03
 """Share of a track's squared residual that its own pull on the estimate makes, up to which first order is enough."""
+AT_ONCE = 4_000_000
+"""Entries of matrices that are worked on together: 32 MB."""
 ROUNDS = 2
 """A heavy track's residuals grow when it is no longer followed."""
 
@@ -48,6 +50,8 @@ class TrackWeights:
     """Information over what is stated, by the positions of factors; empty where tracks are alike."""
     slack: float = 1.0
     """Standard deviations of the estimate over those that weights known beforehand would give."""
+    step: Float | None = None
+    """Shape (n,), from the system's solution to nearly the one with these weights; None where tracks are alike."""
 
 
 def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWeights:
@@ -67,9 +71,11 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWei
         return TrackWeights({})
     weight = np.ones(len(tracks))
     spread: tuple[float, float] | None = None
-    dof = weight
+    dof, step, weighed = weight, None, system
     for _ in range(ROUNDS):
-        chi2, dof = residuals_of_tracks(tracks, system if spread is None else _weighed(system, tracks, weight))
+        if spread is not None:
+            weighed, step = _weighed(system, tracks, weight)
+        chi2, dof = residuals_of_tracks(tracks, weighed)
         spread = spread or spread_of_variances(chi2, dof)
         width, scale = spread
         weight = np.minimum((width + dof) / (width + chi2 / (weight * scale)), MOST)
@@ -77,11 +83,11 @@ def track_weights(active: Active, system: LinearSystem, family: str) -> TrackWei
             return TrackWeights({})
     slack = float(((spread[0] + dof + 2.0) / (spread[0] + dof) * dof).sum() / dof.sum()) if spread else 1.0
     return TrackWeights(
-        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack
+        {int(p): float(w) for (_, positions), w in zip(tracks, weight, strict=True) for p in positions}, slack, step
     )
 
 
-def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> LinearSystem:
+def _weighed(system: LinearSystem, tracks: Views, weight: Float) -> tuple[LinearSystem, Float]:
     root = np.ones(len(system.b))
     for (_, positions), w in zip(tracks, weight, strict=True):
         root[_rows(system, positions)] = np.sqrt(w)
@@ -130,10 +136,15 @@ def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Flo
     if covariance is None:
         return chi2, dof
     followed = _followed(rows, system, place, covariance)
-    for i in np.flatnonzero(followed > LIGHT * chi2):
-        chi2[i], dof[i] = _residual(rows[i], system.columns[tracks[i][0]], system, place, covariance)
-        followed[i] = 0.0
-    return chi2 + followed, dof
+    heavy = np.flatnonzero(followed > LIGHT * chi2)
+    chi2 = chi2 + followed
+    length = np.array([len(rows[i]) for i in heavy], dtype=np.int64)
+    for n in np.unique(length).tolist():
+        alike = heavy[length == n]
+        for part in np.array_split(alike, -(-len(alike) * n * len(covariance) // AT_ONCE)):
+            landmarks = np.array([np.arange(LANDMARK) + system.columns[tracks[i][0]].start for i in part])
+            chi2[part], dof[part] = _residuals(np.array([rows[i] for i in part]), landmarks, system, place, covariance)
+    return chi2, dof
 
 
 def _followed(rows: list[Int], system: LinearSystem, place: Int, covariance: Float) -> Float:
@@ -145,20 +156,29 @@ def _followed(rows: list[Int], system: LinearSystem, place: Int, covariance: Flo
     return ((drawn @ covariance) * drawn).sum(axis=1)
 
 
-def _residual(rows: Int, landmark: slice, system: LinearSystem, place: Int, covariance: Float) -> tuple[float, float]:
-    """`z^T (I - H)^-1 z` of what is left of the residuals when the landmark is eliminated, and its dimension."""
-    part = system.A[rows]
-    columns = np.unique(part.indices)
-    dense = np.zeros((len(rows), len(columns)))
-    dense[np.repeat(np.arange(len(rows)), np.diff(part.indptr)), np.searchsorted(columns, part.indices)] = part.data
-    own = (columns >= landmark.start) & (columns < landmark.stop)
-    free = np.linalg.qr(dense[:, own], mode="complete")[0][:, int(own.sum()) :].T
-    z, B, at = free @ system.b[rows], free @ dense[:, ~own], place[columns[~own]]
-    hat = B @ covariance[np.ix_(at, at)] @ B.T
-    eigenvalues, vectors = np.linalg.eigh(np.eye(len(hat)) - 0.5 * (hat + hat.T))
+def _residuals(rows: Int, landmarks: Int, system: LinearSystem, place: Int, covariance: Float) -> tuple[Float, Float]:
+    """`z^T (I - H)^-1 z` (n,) of what is left of tracks' residuals when their landmarks are eliminated, and its
+    dimension (n,).
+
+    Args:
+        rows: shape (n, m), of n tracks with as many measurements.
+        landmarks: shape (n, 3), their columns.
+        place: of columns in the covariance, -1 for those that are not.
+    """
+    count, m = rows.shape
+    part = system.A[rows.ravel()]
+    B = part[:, np.flatnonzero(place >= 0)]
+    hat = (B @ covariance).reshape(count, m, -1) @ B.toarray().reshape(count, m, -1).transpose(0, 2, 1)
+    i, j = np.arange(count * m).reshape(count, m, 1), landmarks[:, None, :]
+    i, j = (index.ravel() for index in np.broadcast_arrays(i, j))
+    landmark = np.linalg.qr(np.asarray(part[i, j]).reshape(count, m, LANDMARK))[0]
+    free = np.eye(m) - landmark @ landmark.transpose(0, 2, 1)
+    spread = free @ (np.eye(m) - 0.5 * (hat + hat.transpose(0, 2, 1))) @ free
+    eigenvalues, vectors = np.linalg.eigh(spread)
     known = eigenvalues > DETERMINED
-    along = (vectors.T @ z)[known]
-    return float((along**2 / eigenvalues[known]).sum()), max(float(known.sum()), 1e-3)
+    along = (vectors.transpose(0, 2, 1) @ (free @ system.b[rows][..., None]))[..., 0]
+    chi2 = np.where(known, along**2 / np.where(known, eigenvalues, 1.0), 0.0).sum(axis=1)
+    return chi2, np.maximum(known.sum(axis=1), 1e-3)
 
 
 def _rows(system: LinearSystem, positions: Int) -> Int:

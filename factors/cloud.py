@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
-from .geometry import point_to_frame, seen_from
+from .geometry import cross, seen_from
 from .noise import Model
 
 Float = NDArray[np.float64]
@@ -50,16 +50,23 @@ def plane_factor(base: int, landmark: int, plane_point_m: Float, normal: Float, 
     Residual (1,), metres. Variables: `o_T_b`, the landmark, and the depth camera's calibration, which moves c.
     """
 
+    x, y, z = (float(c) for c in plane_point_m)
+    n = (float(normal[0]), float(normal[1]), float(normal[2]))
+
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
-        states = depth_states(values)
-        if jacobians is None:  # most times
-            b_p = seen_from(values.atPose3(base), values.atPoint3(landmark))
-            return np.array([normal @ (b_p - corrected(plane_point_m, *states))])
-        b_p, d_pose, d_point = point_to_frame(values.atPose3(base), values.atPoint3(landmark))
-        jacobians[0] = normal[None, :] @ d_pose
-        jacobians[1] = normal[None, :] @ d_point
-        moves = -normal @ depth_moves(plane_point_m[None], *states)[0]
-        jacobians[2], jacobians[3] = moves[None, :2], moves[None, 2:]
-        return np.array([normal @ (b_p - corrected(plane_point_m, *states))])
+        offset, scale = values.atVector(keys.DEPTH).tolist()
+        right, down, wider = values.atVector(keys.DEPTH_RAYS).tolist()
+        o_T_b = values.atPose3(base)
+        b_p = seen_from(o_T_b, values.atPoint3(landmark))
+        deeper = 1.0 + scale + offset / z
+        # As `corrected`, in scalars: there are hundreds of these factors, each of one number.
+        ray = (x * (1.0 + wider) + z * right, y * (1.0 + wider) + z * down, z)
+        along = n[0] * ray[0] + n[1] * ray[1] + n[2] * ray[2]
+        if jacobians is not None:
+            jacobians[0] = np.array([[*cross(n, b_p.tolist()), -n[0], -n[1], -n[2]]])
+            jacobians[1] = (o_T_b.rotation().matrix() @ normal)[None, :]
+            jacobians[2] = np.array([[-along / z, -along]])
+            jacobians[3] = -deeper * np.array([[n[0] * z, n[1] * z, n[0] * x + n[1] * y]])
+        return np.array([float(normal @ b_p) - deeper * along])
 
     return gtsam.CustomFactor(noise, [base, landmark, keys.DEPTH, keys.DEPTH_RAYS], error)

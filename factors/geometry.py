@@ -1,5 +1,7 @@
 """Poses and their covariances between the conventions: GTSAM's tangent, ROS's fixed axes, plain matrices."""
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +12,11 @@ Float = NDArray[np.float64]
 def skew(v: Float) -> Float:
     """The matrix [v]x with [v]x w = v x w, shape (3, 3)."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    """The vector product of two triples: NumPy takes ten times as long for one."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def pose3(matrix: Float) -> gtsam.Pose3:

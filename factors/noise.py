@@ -35,7 +35,13 @@ def pose_sigmas(rotation_rad: float, translation_m: float) -> Model:
 
 def huber(model: Model, scale: float) -> Model:
     """Residuals beyond `scale` sigmas pull with constant force."""
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(scale), model)
+    return gtsam.noiseModel.Robust.Create(_huber_loss(scale), model)
+
+
+@cache
+def _huber_loss(scale: float) -> gtsam.noiseModel.mEstimator.Base:
+    """It has no state: all models share it."""
+    return gtsam.noiseModel.mEstimator.Huber.Create(scale)
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
-from .geometry import point_to_frame, seen_from
+from .geometry import cross, point_to_frame
 from .measurements import CylinderSighting
 from .noise import Model, gaussian, sigmas
 
@@ -33,29 +33,20 @@ def line_planes(lines: Float, K: Float) -> tuple[Float, Float]:
     return normals / lengths[:, None], lengths
 
 
-def tangency(line: Float, K: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
-    """An outline's plane touches the cylinder: `n . p = radius` for the axis points p = a, b in the camera frame.
+def tangency(line: Float, K: Float, ends: Float, radius: float) -> tuple[Float, Float, float]:
+    """An outline's plane touches the cylinder: `n . p = radius` for two points p of the axis in the camera frame.
 
     Args:
         line: shape (3,), oriented so that the axis lies on the positive side.
+        ends: shape (2, 3).
 
     Returns:
-        residual (2,) in metres, d residual / d (a, b, radius) (2, 7),
-        d residual / d (fx, fy, skew, cx, cy) (2, 5).
+        residual (2,) in metres, n (3,), and the length of `K^T l` that was divided out.
     """
-    normals, lengths = line_planes(line[None], K)
-    n = normals[0]
-    points = np.stack([a, b])
-    distance = points @ n
-    shape_jacobian = np.zeros((2, 7))
-    shape_jacobian[0, :3] = n
-    shape_jacobian[1, 3:6] = n
-    shape_jacobian[:, 6] = -1.0
-    # n = m / |m| with m = K^T l: d(n . p) = (p - (n . p) n) . dm / |m|
-    across = (points - distance[:, None] * n) / lengths[0]
-    l0, l1, _ = line
-    dm = np.array([[l0, 0, 0], [0, l1, 0], [0, l0, 0], [0, 0, l0], [0, 0, l1]])
-    return distance - radius, shape_jacobian, across @ dm.T
+    normal = line @ K
+    length = float(np.sqrt(normal @ normal))
+    normal = normal / length
+    return ends @ normal - radius, normal, length
 
 
 def tangency_covariance(line: Float, covariance: Float, foot_px: Float, K: Float, a: Float, b: Float) -> Float:
@@ -91,39 +82,42 @@ def outline_factor(camera: str, line: Float, noise: Model, pose: int, pipe: int)
     if camera != "m_left":
         variables.append(keys.extrinsics(camera))
 
+    l0, l1, _ = (float(c) for c in line)
+
     def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Float] | None) -> Float:
         o_T_c = values.atPose3(pose)
         c_T_s = values.atPose3(variables[6]) if len(variables) == 7 else None
         K = values.atCal3DS2(variables[1]).K()
         visible = float(values.atVector(variables[4])[0] - values.atVector(variables[5])[0])
-        if jacobians is None:
-            ends = [seen_from(o_T_c, values.atPoint3(variables[2 + i])) for i in range(2)]
-            ends = ends if c_T_s is None else [seen_from(c_T_s, end) for end in ends]
-            return np.stack(ends) @ line_planes(line[None], K)[0][0] - visible
-        seen = [_seen(o_T_c, c_T_s, values.atPoint3(variables[2 + i])) for i in range(2)]
-        residual, d_shape, d_K = tangency(line, K, seen[0][0], seen[1][0], visible)
-        d_a, d_b = d_shape[:, :3], d_shape[:, 3:6]
-        jacobians[0] = d_a @ seen[0][1] + d_b @ seen[1][1]
-        # Edges were fitted in ideal pixels; what the lens model leaves over is far below their sigma.
-        jacobians[1] = np.hstack([d_K, np.zeros((2, 4))])
-        jacobians[2] = d_a @ seen[0][2]
-        jacobians[3] = d_b @ seen[1][2]
-        jacobians[4] = d_shape[:, 6:]
-        jacobians[5] = -d_shape[:, 6:]
+        ends = np.array([values.atPoint3(variables[2]), values.atPoint3(variables[3])])
+        seen = in_camera = (ends - o_T_c.translation()) @ o_T_c.rotation().matrix()
         if c_T_s is not None:
-            jacobians[6] = d_a @ seen[0][3] + d_b @ seen[1][3]
+            seen = (in_camera - c_T_s.translation()) @ c_T_s.rotation().matrix()
+        residual, normal, length = tangency(line, K, seen, visible)
+        if jacobians is None:
+            return residual
+        # n = m / |m| with m = K^T l: d(n . p) = (p - (n . p) n) . dm / |m|
+        across = (seen - (residual + visible)[:, None] * normal) / length
+        d_K = np.zeros((2, 9))
+        d_K[:, :5] = across[:, [0, 1, 1, 2, 2]] * (l0, l1, l0, l0, l1)
+        jacobians[1] = d_K  # what the lens model leaves over is far below the sigma of edges
+        if c_T_s is not None:
+            jacobians[6] = _moved(normal, seen)
+            normal = c_T_s.rotation().matrix() @ normal
+        jacobians[0] = _moved(normal, in_camera)
+        none = np.zeros((1, 3))
+        by_point = (o_T_c.rotation().matrix() @ normal)[None, :]
+        jacobians[2], jacobians[3] = np.concatenate([by_point, none]), np.concatenate([none, by_point])
+        jacobians[4], jacobians[5] = np.full((2, 1), -1.0), np.full((2, 1), 1.0)
         return residual
 
     return gtsam.CustomFactor(noise, variables, error)
 
 
-def _seen(o_T_c: gtsam.Pose3, c_T_s: gtsam.Pose3 | None, o_p: Float) -> tuple[Float, Float, Float, Float]:
-    """A point in the sensor's frame; Jacobians for the pose, the point and the extrinsics."""
-    c_p, d_pose, d_point = point_to_frame(o_T_c, o_p)
-    if c_T_s is None:
-        return c_p, d_pose, d_point, np.zeros((3, 6))
-    s_p, d_extrinsics, d_c = point_to_frame(c_T_s, c_p)
-    return s_p, d_c @ d_pose, d_c @ d_point, d_extrinsics
+def _moved(normal: Float, points: Float) -> Float:
+    """How `normal . p` of two points (2, 3) in a frame follows the frame's pose, rotation first, shape (2, 6)."""
+    n = normal.tolist()
+    return np.array([[*cross(n, p), -n[0], -n[1], -n[2]] for p in points.tolist()])
 
 
 def on_axis_factor(point: int, pipe: int) -> gtsam.CustomFactor:

@@ -1,6 +1,5 @@
 """Pixels of points in {o}: native GTSAM factors, with the camera's calibration as a variable."""
 
-from functools import partial
 from typing import Any
 
 import gtsam
@@ -29,16 +28,10 @@ def mobile_projection(camera: str, px: Float, model: Model, keyframe: int, point
     return _with_extrinsics(camera, px, model, keyframe, point)
 
 
-def reweighed(factor: Any, camera: str, weight: float, robust_sigma: float) -> gtsam.NonlinearFactor:
+def reweighed(factor: Any, weight: float, robust_sigma: float) -> gtsam.NonlinearFactor:
     """A factor of `mobile_projection` or `machine_projection` with `weight` times its information."""
-    involved = factor.keys()
-    pose = next(key for key in involved if keys.kind(key) in "xb")
-    point = next(key for key in involved if keys.kind(key) in "lq")
-    model = robust(
-        gtsam.noiseModel.Gaussian.SqrtInformation(np.sqrt(weight) * factor.noiseModel().noise().R()), robust_sigma
-    )
-    make = machine_projection if camera == "b_rgb" else partial(mobile_projection, camera)
-    return make(factor.measured(), model, pose, point)
+    whitening = np.sqrt(weight) * factor.noiseModel().noise().R()
+    return factor.cloneWithNewNoiseModel(robust(gtsam.noiseModel.Gaussian.SqrtInformation(whitening), robust_sigma))
 
 
 def machine_projection(px: Float, model: Model, base: int, point: int) -> gtsam.NonlinearFactor:

@@ -48,7 +48,8 @@ def run(draw, tracks=400, seed=3, longest=20):
     A = csr_matrix((data, (i, j)), shape=(len(error), 3 * tracks))
     solve = splu((A.T @ A).tocsc()).solve
     b = error - A @ solve(A.T @ error)
-    return active, SimpleNamespace(starts=2 * np.arange(len(active) + 1), b=b, A=A, solve=solve)
+    rows = 2 * np.arange(len(active) + 1)
+    return active, SimpleNamespace(starts=rows, b=b, residuals_of=lambda errors: errors - A @ solve(A.T @ errors))
 
 
 def white(n, rng):

@@ -148,7 +148,7 @@ def test_outline_touches_the_cylinder():
     slope = np.tan(np.arcsin(r / z))
     lines = np.array([[1.0, 0, -(180 - 300 * slope)], [-1.0, 0, 180 + 300 * slope]])
     for line in lines:
-        residual, _, _ = pipe.tangency(line, K, np.array([0, -0.3, z]), np.array([0, 0.4, z]), r)
+        residual, _, _ = pipe.tangency(line, K, np.array([[0, -0.3, z], [0, 0.4, z]]), r)
         np.testing.assert_allclose(residual, 0, atol=1e-12)
 
 

@@ -6,6 +6,8 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from surecut.estimator.linear import LinearSystem
+from surecut.estimator.newton import Elimination, step_with
+from surecut.estimator.newton import gain as newton_gain
 from surecut.factors import keys
 from surecut.factors.errors import ObservabilityError
 
@@ -84,6 +86,77 @@ def test_hat_matrix_and_standardised_residuals():
     spread = np.eye(dof) - hat[rows, rows]
     assert dof == rows.stop - rows.start
     assert total == pytest.approx(system.b[rows] @ np.linalg.solve(spread, system.b[rows]), rel=1e-6)
+
+
+def test_covariances_together_are_those_of_each_alone():
+    system = LinearSystem(*problem(12, 4, True))
+    rows = len(system.b)
+    for root in (None, csr_matrix(np.diag(np.linspace(1, 2, rows)) + np.diag(np.full(rows - 1, 0.3), -1))):
+        system.root = root
+        blocks = [[(keys.keyframe(k), np.eye(6)), (keys.landmark(3 * k), np.ones((6, 3)))] for k in range(4)]
+        for one, found in zip(blocks, system.covariances(blocks), strict=True):
+            np.testing.assert_allclose(found, system.covariance(one), rtol=1e-9, atol=1e-12)
+        X = system.solve(np.hstack([system.selector(one) for one in blocks]))
+        np.testing.assert_allclose(system.spread(X)[:6, :6], system.covariance(blocks[0]), rtol=1e-9, atol=1e-12)
+
+
+def test_one_step_on_is_the_least_squares_solution():
+    graph, values = problem(12, 4, True)
+    system = LinearSystem(graph, values)
+    settled, step, gain = system.settled()
+    wanted, squares = np.linalg.lstsq(system.A.toarray(), system.b, rcond=None)[:2]
+    np.testing.assert_allclose(step, wanted, rtol=1e-6, atol=1e-9)
+    assert settled.b @ settled.b == pytest.approx(squares[0], rel=1e-9)
+    assert gain == pytest.approx(0.5 * (system.b @ system.b - squares[0]), rel=1e-9)
+    linear = graph.linearize(values)
+    assert newton_gain(linear, linear.optimize()) == pytest.approx(gain, rel=1e-6)
+    key = keys.keyframe(2)
+    moved = system.moved(values, step).atPose3(key).localCoordinates(values.atPose3(key))
+    np.testing.assert_allclose(-moved, step[system.columns[key]], atol=1e-3)
+
+
+def test_factors_exchanged_are_as_if_they_had_been_there():
+    graph, values = problem(12, 4, True)
+    removed = [graph.size() - 1, 3]
+    tight = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    new = gtsam.NonlinearFactorGraph()
+    new.add(gtsam.PriorFactorPoint3(keys.landmark(3), values.atPoint3(keys.landmark(3)) + 0.1, tight))
+    wanted = gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if i not in removed:
+            wanted.add(graph.at(i))
+    wanted.add(new.at(0))
+    before = LinearSystem(graph, values)
+    rows = len(before.b)
+    before.root = csr_matrix(np.diag(np.linspace(1, 2, rows)))
+    found, fresh = before.exchanged(removed, new, values), LinearSystem(wanted, values)
+    np.testing.assert_allclose(found.A.toarray(), fresh.A.toarray())
+    np.testing.assert_allclose(found.b, fresh.b)
+    assert found.rows.tolist() == fresh.rows.tolist()
+    fresh.root = found.root
+    np.testing.assert_allclose(found.joint([keys.keyframe(3)]), fresh.joint([keys.keyframe(3)]), rtol=1e-8, atol=1e-12)
+    assert found.error_covariance(np.array([len(found.b) - 1]))[0, 0] == 1.0
+    assert before.b is not found.b
+    assert len(before.b) == rows
+
+
+def test_the_order_of_elimination_outlives_variables():
+    graph, values = problem(12, 4, True)
+    linear, elimination = graph.linearize(values), Elimination()
+    whole = linear.optimize()
+    np.testing.assert_allclose(elimination.solved(linear).at(keys.keyframe(1)), whole.at(keys.keyframe(1)), atol=1e-9)
+    gone = keys.landmark(6)
+    kept = [i for i in range(graph.size()) if gone not in graph.at(i).keys()]
+    moved = step_with(linear, kept, values, elimination)
+    part = gtsam.GaussianFactorGraph()
+    for i in kept:
+        part.push_back(linear.at(i))
+    assert moved is not None
+    np.testing.assert_array_equal(moved.atPoint3(gone), values.atPoint3(gone))
+    wanted = values.atPoint3(keys.landmark(0)) + part.optimize().at(keys.landmark(0))
+    np.testing.assert_allclose(moved.atPoint3(keys.landmark(0)), wanted, atol=1e-9)
+    again = elimination.solved(linear)  # with the variable that was gone
+    np.testing.assert_allclose(again.at(gone), whole.at(gone), atol=1e-9)
 
 
 @pytest.mark.parametrize(

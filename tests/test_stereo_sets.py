@@ -3,8 +3,8 @@
 import gtsam
 import pytest
 
-from surecut.estimator.batch import optimum
 from surecut.estimator.incremental import Incremental
+from surecut.estimator.newton import optimum
 from surecut.simulation.stereo_sets import load, updates
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from surecut.estimator.aside import Aside
-from surecut.estimator.batch import optimum
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
+from surecut.estimator.newton import optimum
 from surecut.estimator.run import finish
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors import keys
