@@ -313,7 +313,7 @@ class Tracks:
                 late, seen = (own[lag:, ::-1], self.seen[lag:, ::-1]) if other else (own[lag:], self.seen[lag:])
                 both = (self.track[lag:] == self.track[:last])[:, None] & seen & self.seen[:last]
                 counts.append(max(int(both.sum()), 1))
-                means.append(np.einsum("icak,icak->ak", late, own[:last]) / counts[-1])
+                means.append(np.einsum("icak,icak,ic->ak", late, own[:last], both.astype(float)) / counts[-1])
         for low, high in pairwise(NEAR):
             total, count = self._neighbours(own, low, high)
             means.append(total / max(count, 1))

@@ -211,11 +211,10 @@ class StereoFrontEnd:
             tracks.points[usable],
             tracks.points_covariance[usable],
             px[usable],
-            covariance[usable],
+            covariance[usable] + self._of_calibration(tracks.points[usable], px[usable], guess),
             (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
-            self._of_calibration(tracks.points[usable], px[usable], guess),
         )
         if motion is None or least_spread(px[usable][motion.inliers, :2]) < self.settings.min_spread * self._diagonal:
             return None

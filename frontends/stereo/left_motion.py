@@ -28,16 +28,6 @@ class LeftProblem:
         self._points_cov, self._px_cov = points_cov, px_cov[:, :2, :2]
         self._focal = np.array([[camera.fx], [camera.fy]])
         self._centre = np.array([[camera.cx], [camera.cy]])
-        self._width: Float = np.ones(len(points))
-        """Factors on the gates."""
-
-    def widen(self, shared_covariance: Float, information: Float) -> None:
-        """Lets pass what all points may be off by together, (n, 4, 4): at most so many times their own variance."""
-        uu, uv, vv = information
-        shared = (
-            shared_covariance[:, 0, 0] * uu + 2.0 * shared_covariance[:, 0, 1] * uv + shared_covariance[:, 1, 1] * vv
-        )
-        self._width = 1.0 + shared
 
     def information(self, pose: Float) -> Float:
         """Weights (3, n): elements uu, uv and vv of the residuals' inverse covariance, as seen from `pose`."""
@@ -54,15 +44,15 @@ class LeftProblem:
 
     def cost(self, pose: Float, information: Float) -> float:
         """Truncated squares: what outliers cost is bounded."""
-        return float(np.minimum(self.chi2(pose, information) / (GATE_2 * self._width), 1.0).sum())
+        return float(np.minimum(self.chi2(pose, information) / GATE_2, 1.0).sum())
 
     def share(self, pose: Float, information: Float) -> float:
         """Share of points within the gate of their own covariance."""
-        return np.count_nonzero(self.chi2(pose, information) < GATE_2 * self._width) / len(self.points)
+        return np.count_nonzero(self.chi2(pose, information) < GATE_2) / len(self.points)
 
-    def gate(self, chi2: Float) -> Float:
-        """Limits (n,) of squared residuals, widened by how much they (n,) exceed their covariance."""
-        return self._width * (GATE_2 * min(max(median(chi2) / MEDIAN_2, 1.0), 16.0))
+    def gate(self, chi2: Float) -> float:
+        """Limit of squared residuals, widened by how much they (n,) exceed their covariance."""
+        return GATE_2 * min(max(median(chi2) / MEDIAN_2, 1.0), 16.0)
 
     def refine(self, pose: Float, information: Float, steps: int = 10) -> Float:
         """Gauss-Newton with the weights of Geman and McClure, as `stereo_motion.StereoProblem.refine`."""

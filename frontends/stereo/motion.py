@@ -43,7 +43,6 @@ def estimate_motion(
     predicted: Sequence[Float],
     rig: StereoGeometry,
     min_inliers: int,
-    shared_covariance: Float | None = None,
 ) -> Motion | None:
     """Motion from points of the reference frame seen again; None without consensus.
 
@@ -57,7 +56,6 @@ def estimate_motion(
             one of them there is no search.
         rig: nominal geometry.
         min_inliers: fewer give None.
-        shared_covariance: (n, 4, 4), px^2, of what all points may be off by together; the gates let it pass.
     """
     if len(points) < max(min_inliers, 6):
         return None
@@ -69,8 +67,6 @@ def estimate_motion(
     candidates = list(predicted)
     # The weights hardly depend on the pose: those of one serve until the end.
     information = data.information(candidates[0] if candidates else np.eye(4))
-    if shared_covariance is not None:
-        data.widen(shared_covariance, information)
     pose = _followed(data, candidates, information)
     if pose is None:
         candidates += [p for p in (_consensus(points, px[:, :2], rig),) if p is not None]

@@ -21,17 +21,11 @@ class StereoProblem:
         both = np.isfinite(px[:, 2])
         self._expected = np.where(both, MEDIAN_4, MEDIAN_2)
         self._gate = np.where(both, GATE_4, GATE_2)
-        self._width: Float = np.ones(len(points))
-        """Factors on the gates."""
         self.seen = np.isfinite(px)
         self.px = np.where(self.seen, px, 0.0)
         # A right pixel that is missing gets a variance that lets its residual, set to zero, say nothing.
         self.px_cov = np.array(px_cov)
         self.px_cov[~both, 2:, 2:] = 1e6 * np.eye(2)
-
-    def widen(self, shared_covariance: Float, information: Float) -> None:
-        """Lets pass what all points may be off by together, (n, 4, 4): at most so many times their own variance."""
-        self._width = 1.0 + np.einsum("nij,nji->n", shared_covariance, information)
 
     def _residuals(self, here: Float) -> Float:
         px = self.rig.project(here)
@@ -54,15 +48,15 @@ class StereoProblem:
 
     def cost(self, pose: Float, information: Float) -> float:
         """Truncated squares: what outliers cost is bounded."""
-        return float(np.minimum(self.chi2(pose, information) / (self._width * self._gate), 1.0).sum())
+        return float(np.minimum(self.chi2(pose, information) / self._gate, 1.0).sum())
 
     def share(self, pose: Float, information: Float) -> float:
         """Share of points within the gate of their own covariance."""
-        return float((self.chi2(pose, information) < self._width * self._gate).mean())
+        return float((self.chi2(pose, information) < self._gate).mean())
 
     def gate(self, chi2: Float) -> Float:
         """Limits (n,) of squared residuals, widened by how much they (n,) exceed their covariance."""
-        return self._width * self._gate * min(max(median(chi2 / self._expected), 1.0), 16.0)
+        return self._gate * min(max(median(chi2 / self._expected), 1.0), 16.0)
 
     def refine(self, pose: Float, information: Float, steps: int = 10) -> Float:
         """Gauss-Newton with the weights of Geman and McClure; the pose is moved from the right.
