@@ -1,6 +1,6 @@
 """The refinement after the run: everything relinearised at once, outliers told apart, then solved again."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -62,11 +62,35 @@ class BatchSolution:
 def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
     """The robust optimum; then what is beyond noise is taken out, first by its residual, then by snooping."""
     off: set[int] = set()
-    rejected: list[Rejection] = []
     elimination = Elimination()
     first, iterations = optimum(log.graph(), start, ON_THE_WAY, elimination)
     at = linearise(log, off, first, robust_sigma)
-    for finder, rounds in ((outliers, 3), (snooped, SNOOPING_ROUNDS)):
+    at, rejected, more = cleaned(log, off, at, robust_sigma, ((outliers, 3), (snooped, SNOOPING_ROUNDS)), elimination)
+    iterations += more
+    at, more, slack, variance = weighed(log, off, at, robust_sigma)
+    at = as_stated(with_correlated_tracks(at, ODOMETRY, slack), variance)
+    iterations += more
+    return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
+
+
+def cleaned(
+    log: FactorLog,
+    off: set[int],
+    at: Linearised,
+    robust_sigma: float,
+    finders: Sequence[tuple[Finder, int]],
+    elimination: Elimination,
+) -> tuple[Linearised, list[Rejection], int]:
+    """Without what is beyond noise, what was taken out, and the iterations.
+
+    Args:
+        off: places of factors that do not count; those that are found join them.
+        at: near the optimum of the others.
+        finders: each with its rounds, one after the other.
+    """
+    rejected: list[Rejection] = []
+    iterations = 0
+    for finder, rounds in finders:
         for _ in range(rounds):
             found = _told_by(finder, at)
             if not found:
@@ -77,12 +101,20 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
             rejected += [r for _, r in found]
             at, more = _without(log, off, at, robust_sigma, elimination)
             iterations += more
+    return at, rejected, iterations
+
+
+def weighed(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[Linearised, int, float, float]:
+    """The optimum with tracks and corners weighed by their residuals, the iterations to there, the slack of the tracks'
+    weights, and the variance of the corners over what is stated.
+
+    Args:
+        at: near the optimum without weights.
+    """
     at = settled(at, robust_sigma)[0]
     variance = corner_variance(at)
-    at, more, slack = _with_weights(log, off, at, robust_sigma, corner_weights(at, variance))
-    at = as_stated(with_correlated_tracks(at, ODOMETRY, slack), variance)
-    iterations += more
-    return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
+    at, iterations, slack = _with_weights(log, off, at, robust_sigma, corner_weights(at, variance))
+    return at, iterations, slack, variance
 
 
 def _without(

@@ -9,23 +9,25 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
-from ..batch import without_factors
+from ..batch import cleaned, outliers, weighed, without_factors
 from ..board_inspection import FAMILY as CORNERS
 from ..consistency import family_tests, judge, prior_tests
-from ..corner_variance import corner_variance
+from ..corner_variance import as_stated, corner_variance
 from ..engine import Engine
 from ..graph import FactorLog
 from ..linear import LinearSystem
-from ..linearised import linearise, with_correlated_tracks
+from ..linearised import Linearised, linearise, with_correlated_tracks
 from ..marginal import FAMILY
+from ..newton import Elimination
 from ..observability import Undetermined, determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
-from ..result import Consistency
+from ..result import Consistency, FamilyConsistency
 
 Float = NDArray[np.float64]
 
 TESTED = ("mount", "known distances", "board geometry", "calibration priors")
+OUTLIER_ROUNDS = 2
 NOT_TESTED = Consistency(0.0, 0.0, (), {}, True, ())
 
 
@@ -61,18 +63,30 @@ def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, se
 
 
 def audit(engine: Engine) -> Audit:
-    """Takes as long as a batch refinement's last step. What earlier keyframes left is widened like tracks are: it is
-    mostly made of them, and cannot be told apart any more; corners by what their residuals show."""
-    log = engine.solver.log
+    """Takes as long as a batch refinement after its first optimum. What earlier keyframes left is widened like tracks
+    are: it is mostly made of them, and cannot be told apart any more; corners by what their residuals show.
+
+    The running estimate has outliers in it, with little weight; whether the model holds is for the others to say.
+    """
+    log, robust_sigma = engine.solver.log, engine.rig.gates.robust_sigma
     values, off = relinearised(log, engine.solver.values())
-    at = with_correlated_tracks(linearise(log, off, values, engine.rig.gates.robust_sigma), ODOMETRY)
+    plain = linearise(log, off, values, robust_sigma)
+    at = with_correlated_tracks(plain, ODOMETRY)
     system = at.system
     variances = {FAMILY: at.inflation, CORNERS: corner_variance(at)}
     wider = np.repeat([np.sqrt(variances.get(record.family, 1.0)) for _, _, record in at.active], system.rows)
     system.root = csr_matrix(diags(wider) if system.root is None else diags(wider) @ system.root)
-    families = tuple(f for f in family_tests(at) if f.family != FAMILY)
-    consistency = judge(families, prior_tests(at.active, system, TESTED), {})
-    return Audit(consistency, _widening(engine, at.system, values))
+    priors = prior_tests(at.active, system, TESTED)
+    widening = _widening(engine, system, values)
+    consistency = judge(_families(log, off, plain, robust_sigma), priors, {})
+    return Audit(consistency, widening)
+
+
+def _families(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[FamilyConsistency, ...]:
+    """Tests of the families as at the end of a recording: without outliers, with tracks weighed."""
+    at = cleaned(log, off, at, robust_sigma, ((outliers, OUTLIER_ROUNDS),), Elimination())[0]
+    at, _, _, variance = weighed(log, off, at, robust_sigma)
+    return tuple(f for f in family_tests(as_stated(at, variance)) if f.family != FAMILY)
 
 
 def _widening(engine: Engine, system: LinearSystem, values: gtsam.Values) -> dict[str, float]:
