@@ -326,25 +326,38 @@ class Incremental:
         chosen = np.concatenate([columns[key] for key in wanted])
         return np.asarray(covariance[np.ix_(chosen, chosen)], np.float64)
 
-    def joint_gaussian(self, wanted: Collection[int]) -> GaussianPrior:
+    def stepped(self, values: gtsam.Values) -> gtsam.Values:
+        """One Newton step on from values, which are not taken over.
+
+        Raises:
+            ObservabilityError: a variable is not determined there.
+        """
+        with determined():
+            return values.retract(self._without(self._unheld).linearize(values).optimize())
+
+    def joint_gaussian(self, wanted: Collection[int], at: gtsam.Values | None = None) -> GaussianPrior:
         """Joint Gaussian of some variables, all others eliminated; those that no factor touches are left out.
 
         Landmarks that nothing determines at this linearisation, such as those behind the cameras that saw them, say
         nothing: they are passed over.
 
+        Args:
+            at: where to linearise; None for the estimate.
+
         Raises:
             ObservabilityError: another variable is not determined.
         """
+        at = self._values if at is None else at
         for _ in range(MOST_DROPPED):
             try:
                 with determined():
-                    return gaussian_of(self._without(self._unheld.difference(wanted)), self._values, wanted)
+                    return gaussian_of(self._without(self._unheld.difference(wanted)), at, wanted)
             except Undetermined as error:
                 if keys.kind(error.key) != "l" or error.key in wanted:
                     raise
                 self._unheld.add(error.key)
         with determined():
-            return gaussian_of(self._without(self._unheld.difference(wanted)), self._values, wanted)
+            return gaussian_of(self._without(self._unheld.difference(wanted)), at, wanted)
 
 
 def _parameters(factorisation: str = "CHOLESKY") -> gtsam.ISAM2Params:

@@ -24,6 +24,9 @@ KEPT_BYTES = 120_000_000
 """Pictures of keyframes that are kept to look for a pipe's outline once it is known."""
 OUTLINE_VIEWS = 16
 """Views per pipe and camera in which its outline is looked for: their errors are alike, more would not tell more."""
+VIEWS_AT_ONCE = 4
+"""Views that one call looks at, at most; the rest is for `go_on`, so that nobody has to wait long. The same for a
+recording as in a stream, so that they answer alike: what is found later enters another estimate."""
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
 AXIS_SIGMA_M, DIRECTION_SIGMA_RAD = 0.006, 0.02
@@ -53,14 +56,8 @@ class _Apart:
 class OutlineSearch:
     """Keeps pictures, and looks for pipes in them where the engine's estimate says that they are."""
 
-    def __init__(self, engine: Engine, views_at_once: int | None = None) -> None:
-        """
-        Args:
-            views_at_once: views of known pipes that one call looks at, at most; the rest is for `go_on`, so that nobody
-                has to wait long. None for all.
-        """
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self._at_once = views_at_once
         self._ahead: deque[_View] = deque()
         """Views that have been chosen and not looked at."""
         self._found: list[OutlineSighting | Rejection] = []
@@ -96,8 +93,8 @@ class OutlineSearch:
     def go_on(self, to_the_end: bool = False) -> None:
         """Looks at views that are chosen; where there are none, nothing happens."""
         number = len(self._ahead)
-        if self._at_once is not None and not to_the_end:
-            number = min(number, self._at_once)
+        if not to_the_end:
+            number = min(number, VIEWS_AT_ONCE)
         views = [self._ahead.popleft() for _ in range(number)]
         self._found += find_outlines([self._outline_view(view) for view in views])
         if self._found and not self._ahead:

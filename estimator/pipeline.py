@@ -22,15 +22,10 @@ class Pipeline:
         rig: Rig,
         associate: Associator = lay_on_surfaces,
         together: int = 1,
-        views_at_once: int | None = None,
     ) -> None:
-        """
-        Args:
-            views_at_once: see `OutlineSearch`.
-        """
         self.rig = rig
         self.engine = Engine(rig, {}, associate, together=together)
-        self._outlines = OutlineSearch(self.engine, views_at_once)
+        self._outlines = OutlineSearch(self.engine)
         self._depths = DepthSearch(self.engine)
         self._base = BaseSearch(self.engine)
 
@@ -51,7 +46,7 @@ class Pipeline:
         if sensed.pair is not None and sensed.stamp_ns in engine.keyframe_at:
             self._outlines.see(sensed.pair, sensed.bundle.picks)
             self._base.see(sensed.pair)
-        else:
+        elif sensed.bundle.frame is not None:  # counted by frames: how a stream splits a moment must not matter
             self._outlines.go_on()
         if sensed.depth is not None:
             engine.add(Bundle(sensed.stamp_ns, cloud=sensed.depth.cloud, moved=sensed.depth.moved))

@@ -29,6 +29,8 @@ class Audits:
         self._period_ns = period_ns
         self._aside: Aside[Audit] = Aside(apart)
         self._next_ns = 0
+        self._next_revisit_ns = 0
+        """Boards that were seen before they had a place are looked at again, which changes the estimate: rarely."""
         self._first_ns: int | None = None
         self._last = Audit()
         self._failing: tuple[int, str] | None = None
@@ -43,8 +45,10 @@ class Audits:
         if engine.odometry.last_keyframe < 0 or engine.graph.unsolved or self._aside.busy():
             return
         self._next_ns = stamp_ns + self._pause_ns(stamp_ns)
-        if engine.boards.any_known():
-            engine.revisit()
+        if stamp_ns >= self._next_revisit_ns or self._next_revisit_ns - stamp_ns > self._period_ns:
+            self._next_revisit_ns = stamp_ns + self._period_ns
+            if engine.boards.any_known():
+                engine.revisit()
         self._aside.begin(lambda: audit(engine))
 
     def _pause_ns(self, stamp_ns: int) -> int:

@@ -29,8 +29,9 @@ from .glances import Glance
 from .knocks import Knocks
 from .memory import Memory, recall, remember, save
 from .parent import give_back
-from .posterior import Posterior, posterior_of
+from .posterior import Posterior
 from .settings import S, StreamSettings
+from .settled import Settled
 from .trust import grown
 from .wire import Answer, Place
 
@@ -39,10 +40,6 @@ Float = NDArray[np.float64]
 PICTURES = 50
 """Cut-outs of clicks that are kept."""
 EVENTS = 50
-SETTLED_SIGMA = 0.3
-"""Standard deviations by which one more step may move an answer."""
-SETTLING = 2
-"""Steps of the solver for one answer: the next answer goes on."""
 
 
 class GraphLoop:
@@ -72,7 +69,7 @@ class GraphLoop:
         self._checkpoint = checkpoint
         self._validated = validated
         self._rig_sha256 = sha256_of(rig)
-        self.pipeline = Pipeline(rig, views_at_once=settings.views_at_once)
+        self.pipeline = Pipeline(rig)
         self.engine = self.pipeline.engine
         self._bounded = Bounded(self.engine, settings.limits)
         if memory is not None:
@@ -80,6 +77,7 @@ class GraphLoop:
             self._bounded.first = memory.keyframes
         self._knocks = Knocks(self.engine)
         self._drift = Drift(self.engine)
+        self._settled = Settled(self.engine)
         self._audits = Audits(self.engine, settings.audit_period_ns, apart)
         self._saving: Aside[str] = Aside(apart)
         self._live = apart
@@ -195,6 +193,12 @@ class GraphLoop:
         self.answer(stamp_ns)
         self._told_s = time.monotonic()
 
+    def settle(self) -> None:
+        """Takes the engine itself to its optimum, which takes as long as several answers."""
+        self.engine.flush()
+        self.engine.state.values = self.engine.solver.settle()
+        self._changed = True
+
     def mark_changed(self) -> None:
         """The next answer is made anew."""
         self._changed = True
@@ -230,7 +234,8 @@ class GraphLoop:
         last = keys.keyframe(engine.odometry.last_keyframe)
         newest = [last] if state.has(last) else []
         try:
-            posterior = self._settled(newest)
+            posterior = self._settled.posterior(newest)
+            self.counts["settling_steps"] = self._settled.steps
         except ObservabilityError:
             self.counts["undetermined"] += 1
             return None
@@ -250,19 +255,6 @@ class GraphLoop:
         )
         self._forget_pictures()
         return replace(answer, decisions=self._decisions(answer, stamp_ns))
-
-    def _settled(self, newest: list[int]) -> Posterior:
-        """What the graph says now. A pipe and its points begin from rough guesses, and iSAM2 relinearises rarely: where
-        one Newton step more moves the answer, the solver goes on."""
-        engine = self.engine
-        posterior = posterior_of(engine, newest)
-        for _ in range(SETTLING):
-            if posterior.step_sigma < SETTLED_SIGMA:
-                break
-            engine.state.values = engine.solver.settle(1)
-            self.counts["settled"] += 1
-            posterior = posterior_of(engine, newest)
-        return posterior
 
     def _places(self, posterior: Posterior, newest: list[int]) -> dict[str, Place]:
         named = {board.id: self.engine.boards.key(board.id) for board in self.rig.boards}

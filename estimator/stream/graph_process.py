@@ -100,8 +100,7 @@ def _finish(loop: GraphLoop, out: Any) -> None:
     """The last answer, with everything that waited."""
     loop.close()
     loop.pipeline.complete()
-    loop.engine.flush()
-    loop.mark_changed()
+    loop.settle()
     loop.answer(loop.engine.end_ns)
     try:
         text = loop.save()

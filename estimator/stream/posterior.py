@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...factors.errors import ObservabilityError
-from ..engine import Engine
 from ..marginal import GaussianPrior
-from .variables import long_lived
 
 Float = NDArray[np.float64]
 
@@ -56,9 +54,3 @@ class Posterior:
     def marginal(self, key: int) -> Float:
         """One variable's own covariance, in its tangent."""
         return self.joint[self.columns[key], self.columns[key]]
-
-
-def posterior_of(engine: Engine, more: Sequence[int] = ()) -> Posterior:
-    """The variables that live on, and `more`."""
-    stay = [*long_lived(engine.state.values), *more]
-    return Posterior(engine.solver.joint_gaussian(stay))

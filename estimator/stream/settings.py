@@ -31,8 +31,6 @@ class StreamSettings:
     """How far back a click may be: pictures of so long are kept."""
     answer_period_ns: int = 400 * MS
     """Points in {b} with covariance at least so often, while measurements come."""
-    views_at_once: int = 4
-    """Pictures that are searched for a pipe's outline before the next answer."""
     glance_period_ns: int = 400 * MS
     """Between looks at the boards while there are no keyframes: a knock is to be told within two seconds."""
     audit_period_ns: int = 20 * S
