@@ -10,10 +10,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ...factors import keys
 from ...factors.errors import ObservabilityError
 from ..marginal import GaussianPrior
 
 Float = NDArray[np.float64]
+
+
+PIPES = "puvr"
+"""Points, and ends and radii of pipes: they begin from rough guesses, all else near its place."""
 
 
 class Posterior:
@@ -38,8 +43,10 @@ class Posterior:
         """Shape (n, n)."""
         step = gtsam.VectorValues()
         delta = self.joint @ prior.g
-        self.step_sigma = float(np.abs(delta / np.sqrt(np.diag(self.joint))).max())
-        """The Newton step, in standard deviations of what moves most: how far from its optimum the estimate was."""
+        moved = np.abs(delta / np.sqrt(np.diag(self.joint)))
+        pipes = [moved[columns].max() for key, columns in self.columns.items() if keys.kind(key) in PIPES]
+        self.step_sigma = float(max(pipes, default=0.0))
+        """The Newton step of pipes and points, in standard deviations: how far from its optimum the estimate was."""
         for key, columns in self.columns.items():
             step.insert(key, delta[columns])
         self.values: gtsam.Values = prior.at.retract(step)

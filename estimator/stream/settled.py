@@ -15,7 +15,7 @@ from ..marginal import only
 from .posterior import Posterior
 from .variables import long_lived
 
-SETTLED_SIGMA = 0.3
+SETTLED_SIGMA = 0.5
 """Standard deviations by which one more step may move an answer."""
 STEPS = 2
 """For one answer: the next one goes on."""
