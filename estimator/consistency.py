@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.chance import chi2_cdf, chi2_ppf, normal_isf
-from .board_inspection import FAMILY as CORNERS
 from .graph import Record
 from .linear import LinearSystem, deviate
 from .linearised import Linearised
@@ -19,9 +18,6 @@ FALSE_ALARM = 1e-3
 """Probability, per family, that a correct model is called inconsistent."""
 SIGMA_TOLERANCE = 0.25
 """Noise levels are known to a quarter: a family is inconsistent when its residuals need sigmas larger than that."""
-MENDED_TOLERANCE = 0.5
-"""For marker corners: the answer's covariance already holds what their residuals say (`corner_variance.py`), and that
-a factor for all of them is enough."""
 PRIOR_FALSE_ALARM = 1e-4
 
 
@@ -49,7 +45,7 @@ def family_tests(at: Linearised) -> tuple[FamilyConsistency, ...]:
         norms, rows = at.norms[group == g], system.rows[group == g]
         dof = max(float(rows.sum() - shares[g]), 0.0)
         soft = int((norms > 3.0 * np.sqrt(rows)).sum())
-        lower, upper = limits(dof, MENDED_TOLERANCE if family == CORNERS else SIGMA_TOLERANCE)
+        lower, upper = limits(dof)
         tenths = tuple(int(n) for n in np.histogram(chi2_cdf(norms**2, rows), 10, (0.0, 1.0))[0])
         total = float((norms**2).sum())
         tests.append(FamilyConsistency(family, total, dof, lower, upper, len(norms), soft, tenths))

@@ -1,6 +1,6 @@
 """The running solver: iSAM2 over the factors as they come."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -139,11 +139,11 @@ class Incremental:
         self.dropped.append(landmark)
         self._erase({landmark})
 
-    def leave_out(self, landmarks: Iterable[int]) -> gtsam.Values:
-        """Takes landmarks out with all of their factors; `settle` or the next update begins anew without them."""
-        self._erase(set(landmarks))
+    def exchange(self, factors: Mapping[int, gtsam.NonlinearFactor]) -> None:
+        """Other factors over the same variables, by place in the log; `settle` or the next update begins anew."""
+        for index, factor in factors.items():
+            self.log.replace(index, factor)
         self._relocated = True
-        return gtsam.Values(self._values)
 
     def _erase(self, landmarks: set[int]) -> None:
         for index, factor, record in [row for row in self.log.active() if not landmarks.isdisjoint(row[1].keys())]:

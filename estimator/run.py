@@ -14,7 +14,7 @@ from .batch import BatchSolution, solve
 from .board_faults import settle_boards
 from .bundle import bundles
 from .engine import Engine
-from .pipe_tracks import leave_out_pipe_tracks
+from .pipe_tracks import widen_pipe_tracks
 from .result import Result
 from .summary import Summary
 from .surfaces import Associator
@@ -36,7 +36,7 @@ def solved(engine: Engine, apart: bool = False) -> BatchSolution:
             "there is nothing to estimate: no stereo pair and no known marker was seen; check topics and marker ids in "
             "the rig file (`surecut info LOG`)"
         )
-    leave_out_pipe_tracks(engine)
+    widen_pipe_tracks(engine)
     solution = _both_ways(engine) if apart else _refined(engine)
     return settle_boards(engine, solution)
 

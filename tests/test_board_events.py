@@ -113,10 +113,10 @@ def test_two_markers_in_each_others_place():
     assert_not_bent(run, result)
 
 
-@pytest.mark.parametrize(("seed", "at_s", "shift_m"), [(2, 0.0, 0.006), (2, 2.0, 0.006), (4, 0.0, 0.002)])
-def test_marker_out_of_place(seed, at_s, shift_m):
+@pytest.mark.parametrize(("at_s", "shift_m"), [(0.0, 0.006), (2.0, 0.006), (0.0, 0.002)])
+def test_marker_out_of_place(at_s, shift_m):
     board = {"loose": 1, "loose_at_s": at_s, "loose_shift_m": [shift_m, 0.0], "loose_turn_rad": 0.0}
-    run, result = run_of(seed, board=board)
+    run, result = run_of(2, board=board)
     assert_only(result, "marker_loose")
     (event,) = told(result, "marker_loose")
     assert event.values["marker"] == 1.0

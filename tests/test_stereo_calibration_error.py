@@ -10,8 +10,10 @@ from surecut.factors.camera import CameraModel
 from surecut.frontends.stereo.calibration_error import of_calibration
 from surecut.frontends.stereo.geometry import StereoGeometry, inverse, project, transform
 from surecut.frontends.stereo.motion import estimate_motion
+from surecut.frontends.stereo.settings import StereoSettings
 
 FOCAL, CENTRE = 0.003, 1.0
+SETTINGS = StereoSettings(focal_sigma_rel=FOCAL, centre_sigma_px=CENTRE)
 
 
 def geometry(focal=270.0, cx=180.0, cy=120.0):
@@ -44,7 +46,7 @@ def seen_with(rig, nominal, pixels, depths, pose):
 def test_a_camera_that_stands_still_sees_nothing_of_it():
     rig, p = geometry(), points()
     px = rig.project(p)
-    np.testing.assert_allclose(of_calibration(p, px, np.eye(4), rig, FOCAL, CENTRE), 0.0, atol=1e-12)
+    np.testing.assert_allclose(of_calibration(p, px, np.eye(4), rig, SETTINGS), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,7 @@ def test_it_is_the_derivative_of_the_pixels(pose):
     rig, p = geometry(), points()
     pixels = project(p, rig.left)
     px = rig.project(transform(inverse(pose), p))
-    covariance = of_calibration(p, px, pose, rig, FOCAL, CENTRE)
+    covariance = of_calibration(p, px, pose, rig, SETTINGS)
     step, columns = 1e-4, []
     for sigma, changed in (
         (FOCAL * 270.0, geometry(focal=270.0 + step)),
@@ -83,9 +85,9 @@ def test_tracks_of_a_turning_camera_are_within_their_gate_with_a_focal_length_tw
     px = px + 0.05 * rng.normal(size=px.shape)
 
     def kept(shared):
-        motion = estimate_motion(believed, points_covariance, px, covariance + shared, [pose], nominal, 12)
+        motion = estimate_motion(believed, points_covariance, px, covariance, [pose], nominal, 12, shared)
         assert motion is not None
         return motion.inliers.mean()
 
-    assert kept(of_calibration(believed, px, pose, nominal, FOCAL, CENTRE)) == 1.0
-    assert kept(0.0) < 1.0
+    assert kept(of_calibration(believed, px, pose, nominal, SETTINGS)) == 1.0
+    assert kept(None) < 1.0

@@ -3,15 +3,11 @@
 import numpy as np
 
 from .geometry import Float, StereoGeometry, inverse, project, projection_jacobian, transform
+from .settings import StereoSettings
 
 
 def of_calibration(
-    points: Float,
-    px: Float,
-    reference_T_this: Float,
-    rig: StereoGeometry,
-    focal_sigma_rel: float,
-    centre_sigma_px: float,
+    points: Float, px: Float, reference_T_this: Float, rig: StereoGeometry, settings: StereoSettings
 ) -> Float:
     """Covariance (n, 4, 4) of left and right pixels, by focal length and principal point, first order.
 
@@ -24,6 +20,7 @@ def of_calibration(
         px: (n, 4), ideal left and right pixels in this frame; the left ones count.
         reference_T_this: (4, 4), about.
         rig: nominal geometry; both cameras err alike.
+        settings: with the calibration's sigmas.
     """
     camera = rig.left
     centre = np.array([camera.cx, camera.cy])
@@ -35,6 +32,8 @@ def of_calibration(
     reference = project(points, camera) - centre
     by_focal = px[:, :2] - centre - np.einsum("nij,nj->ni", carried, reference)
     by_centre = np.eye(2) - carried
-    both = np.concatenate((focal_sigma_rel * by_focal[:, :, None], centre_sigma_px * by_centre), axis=2)
+    both = np.concatenate(
+        (settings.focal_sigma_rel * by_focal[:, :, None], settings.centre_sigma_px * by_centre), axis=2
+    )
     both = np.nan_to_num(np.concatenate((both, both), axis=1))
     return both @ both.transpose(0, 2, 1)

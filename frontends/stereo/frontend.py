@@ -211,25 +211,18 @@ class StereoFrontEnd:
             tracks.points[usable],
             tracks.points_covariance[usable],
             px[usable],
-            covariance[usable] + self._of_calibration(tracks.points[usable], px[usable], guess),
+            covariance[usable],
             (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
+            of_calibration(tracks.points[usable], px[usable], guess, self.rig, self.settings),
         )
         if motion is None or least_spread(px[usable][motion.inliers, :2]) < self.settings.min_spread * self._diagonal:
             return None
         strikes = np.zeros(len(tracks), dtype=np.int64)
         strikes[usable] = np.where(motion.inliers, 0, 1 + (motion.chi2 > 60.0))
         tracks.strikes = np.where(strikes > 0, tracks.strikes + strikes, 0)
-        inliers = np.zeros(len(tracks), dtype=bool)
-        inliers[usable] = motion.inliers
-        chi2 = np.full(len(tracks), np.nan)
-        chi2[usable] = motion.chi2
-        return Motion(motion.reference_T_this, inliers, chi2)
-
-    def _of_calibration(self, points: Float, px: Float, guess: Float) -> Float:
-        sigmas = self.settings.focal_sigma_rel, self.settings.centre_sigma_px
-        return of_calibration(points, px, guess, self.rig, *sigmas)
+        return motion.of_all(np.asarray(usable))
 
     def _wants_keyframe(self, left_px: Float, pose: Float) -> str | None:
         flow = left_px - self._tracks.keyframe_px

@@ -27,6 +27,12 @@ class Motion:
     chi2: Float
     """Shape (n,): squared residual in sigmas, of 4 components where the right image has the point, else of 2."""
 
+    def of_all(self, used: Bool) -> "Motion":
+        """The same for all points: those that were not used (m,) are no inliers, and have no residual."""
+        inliers, chi2 = np.zeros(len(used), dtype=bool), np.full(len(used), np.nan)
+        inliers[used], chi2[used] = self.inliers, self.chi2
+        return Motion(self.reference_T_this, inliers, chi2)
+
 
 def point_covariance(points: Float, covariance: Float, rig: StereoGeometry) -> Float:
     """Covariance (n, 3, 3) of triangulated points from that of their pixels (n, 4, 4), first order."""
@@ -43,6 +49,7 @@ def estimate_motion(
     predicted: Sequence[Float],
     rig: StereoGeometry,
     min_inliers: int,
+    shared_covariance: Float | None = None,
 ) -> Motion | None:
     """Motion from points of the reference frame seen again; None without consensus.
 
@@ -56,14 +63,12 @@ def estimate_motion(
             one of them there is no search.
         rig: nominal geometry.
         min_inliers: fewer give None.
+        shared_covariance: (n, 4, 4), px^2, of what all points may be off by together: the motion follows it, the test
+            of each point does not hold it against the point.
     """
     if len(points) < max(min_inliers, 6):
         return None
-    data: LeftProblem | StereoProblem
-    if np.isfinite(px[:, 2]).any():
-        data = StereoProblem(points, points_covariance, px, px_covariance, rig)
-    else:
-        data = LeftProblem(points, points_covariance, px, px_covariance, rig.left)
+    data = _problem(points, points_covariance, px, px_covariance, rig)
     candidates = list(predicted)
     # The weights hardly depend on the pose: those of one serve until the end.
     information = data.information(candidates[0] if candidates else np.eye(4))
@@ -74,11 +79,22 @@ def estimate_motion(
             return None
         start = min(candidates, key=lambda p: data.cost(p, information))
         pose = min((data.refine(start, information), start), key=lambda p: data.cost(p, information))
+    if shared_covariance is not None:
+        data = _problem(points, points_covariance, px, px_covariance + shared_covariance, rig)
     chi2 = data.chi2(pose, data.information(pose))
     inliers = chi2 < data.gate(chi2)
     if inliers.sum() < min_inliers:
         return None
     return Motion(pose, inliers, chi2)
+
+
+def _problem(
+    points: Float, points_covariance: Float, px: Float, px_covariance: Float, rig: StereoGeometry
+) -> LeftProblem | StereoProblem:
+    """In both images, or in the left one alone where no point is in the right."""
+    if np.isfinite(px[:, 2]).any():
+        return StereoProblem(points, points_covariance, px, px_covariance, rig)
+    return LeftProblem(points, points_covariance, px, px_covariance, rig.left)
 
 
 def _followed(data: LeftProblem | StereoProblem, candidates: list[Float], information: Float) -> Float | None:
