@@ -7,9 +7,9 @@ from dataclasses import dataclass
 class Limits:
     """How much of the past stays as it was measured."""
 
-    keyframes: int = 80
-    """Keyframes in the graph, at most; a recording of half a minute makes about 60."""
-    step: int = 30
+    keyframes: int = 60
+    """Keyframes in the graph, at most; a recording of half a minute makes about 30."""
+    step: int = 20
     """Keyframes that leave together: the more, the more rarely the solver begins anew."""
     map_landmarks: int = 60
     """Landmarks of keyframes that left which stay, so that places that are seen again hold the camera."""

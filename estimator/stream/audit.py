@@ -1,7 +1,8 @@
 """From time to time: does the model agree with its own data, and how far do correlated tracks widen the answer?"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -9,20 +10,21 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, diags
 
 from ...factors import keys
-from ..batch import cleaned, outliers, weighed, without_factors
+from ..batch import cleaned, outliers, without_factors
 from ..board_inspection import FAMILY as CORNERS
 from ..consistency import family_tests, judge, prior_tests
-from ..corner_variance import as_stated, corner_variance
+from ..corner_variance import as_stated, corner_variance, weights
 from ..engine import Engine
 from ..graph import FactorLog
 from ..linear import LinearSystem
-from ..linearised import Linearised, linearise, with_correlated_tracks
+from ..linearised import Linearised, linearise, residual_norms, settled, with_correlated_tracks
 from ..marginal import FAMILY
 from ..newton import Elimination
 from ..observability import Undetermined, determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
 from ..result import Consistency, FamilyConsistency
+from ..track_weights import track_weights
 
 Float = NDArray[np.float64]
 
@@ -85,8 +87,29 @@ def audit(engine: Engine) -> Audit:
 def _families(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float) -> tuple[FamilyConsistency, ...]:
     """Tests of the families as at the end of a recording: without outliers, with tracks weighed."""
     at = cleaned(log, off, at, robust_sigma, ((outliers, OUTLIER_ROUNDS),), Elimination())[0]
-    at, _, _, variance = weighed(log, off, at, robust_sigma)
+    at = settled(at, robust_sigma)[0]
+    variance = corner_variance(at)
+    at = _weighed(
+        at, {**track_weights(at.active, at.system, ODOMETRY).by_position, **weights(at, variance)}, robust_sigma
+    )
     return tuple(f for f in family_tests(as_stated(at, variance)) if f.family != FAMILY)
+
+
+def _weighed(at: Linearised, by_position: Mapping[int, float], robust_sigma: float) -> Linearised:
+    """With other weights of some factors, nothing linearised anew: as the tests want to know it, that changes nothing.
+
+    Args:
+        by_position: information over what is stated.
+    """
+    if not by_position:
+        return at
+    root = np.ones(len(at.active))
+    root[list(by_position)] = np.sqrt(list(by_position.values()))
+    system, step = at.system.weighed_rows(np.repeat(root, at.system.rows))
+    stated = copy(system)
+    stated.b = system.b / np.repeat(root, at.system.rows)  # as the robust loss has softened it
+    norms = root * residual_norms(stated, at.rejectable, robust_sigma)
+    return replace(at, values=system.moved(at.values, step), system=system, norms=norms)
 
 
 def _widening(engine: Engine, system: LinearSystem, values: gtsam.Values) -> dict[str, float]:
