@@ -14,6 +14,7 @@ An unexpected exception is a defect and keeps its traceback.
 """
 
 import ast
+import atexit
 import gc
 import importlib.util
 import os
@@ -39,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a bad image is told in our own one line
     use_one_thread()
     gc.set_threshold(COLLECT_EVERY)
+    atexit.register(gc.freeze)  # nothing is searched for unreachable objects at the end: all memory is given back at once
     given = list(sys.argv[1:] if arguments is None else arguments)
     run = typer.main.get_command(application(given))
     try:
