@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # a bad image is told in our own one line
     use_one_thread()
     gc.set_threshold(COLLECT_EVERY)
-    atexit.register(gc.freeze)  # nothing is searched for unreachable objects at the end: all memory is given back at once
+    atexit.register(gc.freeze)  # at the end nobody searches what the system takes back anyway
     given = list(sys.argv[1:] if arguments is None else arguments)
     run = typer.main.get_command(application(given))
     try:
@@ -55,7 +55,11 @@ def application(arguments: Sequence[str]) -> typer.Typer:
     app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.callback()(_options)
     wanted = next((argument for argument in arguments if not argument.startswith("-")), None)
-    for point in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+    points = sorted(entry_points(group=GROUP), key=lambda entry: entry.name)
+    named = [point for point in points if point.name == wanted]
+    if named and arguments[0] == wanted:  # nobody will see the list
+        points = named
+    for point in points:
         if point.name != wanted:
             app.command(point.name, help=summary_of(point))(_not_loaded)
             continue

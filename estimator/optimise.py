@@ -5,15 +5,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..factors.errors import LogError, SurecutError
 from ..factors.measurements import Event
 from ..factors.rig import Rig, dump_rig, load_rig
 from ..io.ordering import OrderReport
 from ..io.reader import LogReader
-from .result import Result
 from .sensed_log import SensedLog, opened
 from .stopwatch import Stopwatch
+
+if TYPE_CHECKING:
+    from .result import Result
 
 TOGETHER = 3
 """Keyframes that share an update of the solver: nobody waits for the answer in between."""
@@ -44,7 +47,7 @@ def optimise(
     progress: Progress | None = None,
     command: str = "",
     processes: int = 1,
-) -> Result:
+) -> "Result":
     """The joint estimate of one recording.
 
     Args:

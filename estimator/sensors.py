@@ -8,22 +8,20 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..factors.calibration import left_T_right
-from ..factors.camera import CameraModel
+from ..factors.camera import CameraModel, rectified_pair
 from ..factors.errors import LogError
 from ..factors.measurements import CameraName, MarkerSighting, Pick, Rejection, StereoFrame
 from ..factors.rig import Rig
-from ..frontends.fiducials.detector import MarkerFrontEnd
-from ..frontends.fiducials.messages import sightings_from_messages
-from ..frontends.paper_chain import clicked_point
 from ..frontends.stereo.atlas import Atlas, Memorable
 from ..frontends.stereo.frontend import Early, StereoFrontEnd
+from ..frontends.stereo.geometry import exponential
 from ..frontends.stereo.settings import StereoSettings
 from ..frontends.undistort import undistort
 from ..io.messages import DetectionsBody, PickBody
 from .sides import swapped
 
 if TYPE_CHECKING:
+    from ..frontends.fiducials.detector import MarkerFrontEnd
     from .depth_sensor import DepthSensor, DepthView
 
 Float = NDArray[np.float64]
@@ -131,7 +129,10 @@ class Sensors:
 
     def left_T_right(self) -> Float:
         """Nominal pose of the right mobile camera in the left one, (4, 4)."""
-        return left_T_right(self._camera("m_left"), self._camera("m_right"), self.rig.stereo).matrix()
+        left, right, given = self._camera("m_left"), self._camera("m_right"), self.rig.stereo.m_left_T_m_right
+        if given is None:
+            return rectified_pair(left, right)
+        return exponential(np.array([*given.rotation_vector_rad, *given.translation_m]))  # no GTSAM
 
     def _check_sides(self, pair: PairImages, frame: StereoFrame) -> None:
         """The first pairs: where hardly a feature of the left image is in the right one, are they exchanged?"""
@@ -168,6 +169,8 @@ class Sensors:
         """Depth of the surface under a click in the left image by semi-global matching, and its sigma, m."""
         if pick.camera != "m_left":
             return None
+        from ..frontends.paper_chain import clicked_point
+
         left, right = self.cameras["m_left"], self.cameras["m_right"]
         point = clicked_point(pair.left, pair.right, left, right, pick.raw_px)
         if point is None:
@@ -187,6 +190,8 @@ class Sensors:
         if not self.rig.boards or camera not in self.cameras:
             return []
         if camera not in self._markers:
+            from ..frontends.fiducials.detector import MarkerFrontEnd  # who only follows the camera starts sooner
+
             self._fits(self.cameras[camera], image, getattr(self.rig.cameras, camera).image_topic)
             self._markers[camera] = MarkerFrontEnd(self.rig, self.cameras[camera], cast(CameraName, camera))
         found, refused = self._markers[camera].process(stamp_ns, image)
@@ -195,6 +200,8 @@ class Sensors:
 
     def detections(self, camera: str, stamp_ns: int, body: DetectionsBody) -> list[MarkerSighting]:
         """Markers that were detected elsewhere."""
+        from ..frontends.fiducials.messages import sightings_from_messages
+
         name = cast(CameraName, camera)
         found, refused = sightings_from_messages(
             self.rig, self._camera(camera), name, stamp_ns, body.families, [int(i) for i in body.ids], body.corners_px
@@ -206,9 +213,7 @@ class Sensors:
 
     @cached_property
     def kinect(self) -> "DepthSensor":
-        from .depth_sensor import (
-            DepthSensor,
-        )  # with libraries that who only follows the mobile camera need not wait for
+        from .depth_sensor import DepthSensor  # with libraries that who only follows the camera need not wait for
 
         return DepthSensor(self.rig.kinect)
 

@@ -5,8 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import keys
-from .camera import CameraModel
-from .geometry import pose_from_vectors
+from .camera import CameraModel, rectified_pair
+from .geometry import pose3, pose_from_vectors
 from .noise import gaussian, sigmas
 from .rig import Camera, Kinect, Stereo
 
@@ -51,17 +51,11 @@ def intrinsics_prior(name: str, camera: CameraModel, settings: Camera) -> gtsam.
 
 
 def left_T_right(left: CameraModel, right: CameraModel, stereo: Stereo) -> gtsam.Pose3:
-    """The right camera's optical frame in the left one's, from the rig or from the camera_info pair.
-
-    With camera_info, a direction d_left rectifies to R_left d_left, and the rectified right camera sits at
-    (baseline, 0, 0) in the rectified left frame: `left_T_right = R_left^T * Translation(b, 0, 0) * R_right`.
-    """
+    """The right camera's optical frame in the left one's, from the rig or from the camera_info pair."""
     if stereo.m_left_T_m_right is not None:
         given = stereo.m_left_T_m_right
         return pose_from_vectors(given.translation_m, given.rotation_vector_rad)
-    baseline = right.baseline_m or 0.0
-    R_left, R_right = left.rectification, right.rectification
-    return gtsam.Pose3(gtsam.Rot3(R_left.T @ R_right), R_left.T @ np.array([baseline, 0.0, 0.0]))
+    return pose3(rectified_pair(left, right))
 
 
 def stereo_sigmas(mean: gtsam.Pose3, stereo: Stereo) -> Float:

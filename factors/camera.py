@@ -46,3 +46,15 @@ class CameraModel:
     @property
     def cy(self) -> float:
         return float(self.K[1, 2])
+
+
+def rectified_pair(left: CameraModel, right: CameraModel) -> Float:
+    """`left_T_right`, shape (4, 4), of two cameras' optical frames, as their rectification states it.
+
+    A direction d_left rectifies to R_left d_left, and the rectified right camera sits at (baseline, 0, 0) in the
+    rectified left frame: `left_T_right = R_left^T * Translation(b, 0, 0) * R_right`.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = left.rectification.T @ right.rectification
+    pose[:3, 3] = left.rectification.T @ np.array([right.baseline_m or 0.0, 0.0, 0.0])
+    return pose

@@ -20,7 +20,7 @@ Vector3 = tuple[Finite, Finite, Finite]
 
 
 class Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)  # each once, when the rig is read
 
 
 class Pose(Section):

@@ -5,19 +5,17 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
 from ...factors.errors import SurecutError
 from ...io.reader import LogReader
-from ..executor import Outcome, choose_executor
 from ..optimise import optimise
-from ..output_files import write_text
-from ..result import Result
+
+if TYPE_CHECKING:
+    from ..executor import Outcome
+    from ..result import Result
 
 HELP_EPILOG = """Examples:
 
@@ -136,14 +134,17 @@ def run_job(job: Job) -> str:
     return f"{len(result.points)} points, largest 95 % radius {1e3 * radius:.1f} mm, {state}"
 
 
-def _print(result: Result) -> None:
+def _print(result: "Result") -> None:
+    from rich.console import Console
+
     from ..tables import result_tables
 
     result_tables(result, Console())
 
 
-def _write(job: Job, result: Result) -> None:
-    from ..result_json import to_json  # with libraries that need not be there before the front ends start
+def _write(job: Job, result: "Result") -> None:
+    from ..output_files import write_text  # with libraries that need not be there before the front ends start
+    from ..result_json import to_json
     from ..result_log import tum_text, write_result
 
     for path in (job.output, job.json, job.tum):
@@ -158,8 +159,20 @@ def _write(job: Job, result: Result) -> None:
         write_text(job.tum, tum_text(result, job.frame))
 
 
-def _with_progress(job: Job) -> Result:
-    """One log with a bar over its time."""
+def _with_progress(job: Job) -> "Result":
+    """One log with a bar over its time, where somebody can see it."""
+    if sys.stderr.isatty():
+        result = _with_bar(job)
+    else:
+        result = optimise(job.log, job.rig, job.between, None, job.command, processes=PROCESSES)
+    _write(job, result)
+    return result
+
+
+def _with_bar(job: Job) -> "Result":
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
@@ -177,11 +190,9 @@ def _with_progress(job: Job) -> Result:
         bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
     try:
-        result = optimise(job.log, job.rig, job.between, advance, job.command, processes=PROCESSES)
+        return optimise(job.log, job.rig, job.between, advance, job.command, processes=PROCESSES)
     finally:
         bar.stop()
-    _write(job, result)
-    return result
 
 
 def _time_range(log: Path) -> tuple[int, float | None]:
@@ -194,6 +205,12 @@ def _time_range(log: Path) -> tuple[int, float | None]:
 
 def _many(work: Sequence[Job], jobs: int, dask: str | None) -> None:
     """Many logs; a failing one is a row with its reason and does not stop the others."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Table
+
+    from ..executor import choose_executor
+
     console = Console()
     table = Table("log", "result")
     failed = 0
