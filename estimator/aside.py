@@ -5,6 +5,7 @@ holds the interpreter while it works, so that a thread would not do.
 """
 
 import contextlib
+import gc
 import os
 import pickle
 import select
@@ -120,6 +121,7 @@ def _copy(work: Callable[[], object], end: int, niceness: int) -> None:
     """The copy's life; it never returns."""
     try:
         os.nice(niceness)
+        gc.disable()  # a search would write to all memory that is shared with the original until then
         said = pickle.dumps(_done(work))
         while said:
             said = said[os.write(end, said) :]

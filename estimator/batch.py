@@ -1,7 +1,7 @@
 """The refinement after the run: everything relinearised at once, outliers told apart, then solved again."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -59,8 +59,18 @@ class BatchSolution:
     """The factors that are left, at the solution."""
 
 
-def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolution:
-    """The robust optimum; then what is beyond noise is taken out, first by its residual, then by snooping."""
+def solve(
+    log: FactorLog,
+    start: gtsam.Values,
+    robust_sigma: float,
+    meanwhile: Callable[[BatchSolution], None] | None = None,
+) -> BatchSolution:
+    """The robust optimum; then what is beyond noise is taken out, first by its residual, then by snooping.
+
+    Args:
+        meanwhile: gets the solution as soon as it is there; its covariances do not know yet that the errors of a track
+            are correlated.
+    """
     off: set[int] = set()
     elimination = Elimination()
     first, iterations = optimum(log.graph(), start, ON_THE_WAY, elimination)
@@ -68,9 +78,11 @@ def solve(log: FactorLog, start: gtsam.Values, robust_sigma: float) -> BatchSolu
     at, rejected, more = cleaned(log, off, at, robust_sigma, ((outliers, 3), (snooped, SNOOPING_ROUNDS)), elimination)
     iterations += more
     at, more, slack, variance = weighed(log, off, at, robust_sigma)
-    at = as_stated(with_correlated_tracks(at, ODOMETRY, slack), variance)
-    iterations += more
-    return BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations, at)
+    at = as_stated(at, variance)
+    found = BatchSolution(at.values, first, tuple(sorted(off)), tuple(rejected), iterations + more, at)
+    if meanwhile is not None:
+        meanwhile(found)
+    return replace(found, at=with_correlated_tracks(at, ODOMETRY, slack))
 
 
 def cleaned(

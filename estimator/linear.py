@@ -99,10 +99,11 @@ class LinearSystem:
     @cached_property
     def _normal(self) -> NormalEquations:
         """Only covariances need it, residuals do not."""
-        return NormalEquations(self._information, self.columns)
+        return NormalEquations(self.information, self.columns)
 
     @cached_property
-    def _information(self) -> csr_matrix:
+    def information(self) -> csr_matrix:
+        """`A^T A`, shape (parameters, parameters)."""
         return csr_matrix(self.A.T @ self.A)
 
     @property
@@ -173,7 +174,7 @@ class LinearSystem:
         rows = np.repeat(stays, self.rows)
         other = self._other(csr_matrix(vstack([self.A[rows], J])), np.concatenate([self.b[rows], new.b]))
         gone = self.A[~rows]
-        other._information = csr_matrix(self._information - gone.T @ gone + J.T @ J)
+        other.information = csr_matrix(self.information - gone.T @ gone + J.T @ J)
         other.rows = np.concatenate([self.rows[stays], new.rows])
         other.starts = np.concatenate([[0], np.cumsum(other.rows)])
         if self.root is not None:
@@ -183,7 +184,7 @@ class LinearSystem:
     def _other(self, A: csr_matrix, b: Float) -> "LinearSystem":
         """Of the same variables."""
         other = copy(self)
-        for cached in ("_normal", "_information"):
+        for cached in ("_normal", "information"):
             other.__dict__.pop(cached, None)
         other.A, other.b, other.root = A, b, None
         return other

@@ -1,6 +1,6 @@
 """Measurements to result: the one loop, its end, and the batch refinement."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import gtsam
@@ -15,12 +15,16 @@ from .board_faults import settle_boards
 from .bundle import bundles
 from .engine import Engine
 from .pipe_tracks import widen_pipe_tracks
+from .plain_tests import PlainTests
 from .result import Result
 from .summary import Summary
 from .surfaces import Associator
 
+Meanwhile = Callable[[BatchSolution], None]
+"""Called with a solution while it is found out how the errors of its tracks are correlated."""
 
-def solved(engine: Engine, apart: bool = False) -> BatchSolution:
+
+def solved(engine: Engine, apart: bool = False, meanwhile: Meanwhile | None = None) -> BatchSolution:
     """Settles iSAM2, and refines in batch over the same factors.
 
     Args:
@@ -37,29 +41,31 @@ def solved(engine: Engine, apart: bool = False) -> BatchSolution:
             "the rig file (`surecut info LOG`)"
         )
     widen_pipe_tracks(engine)
-    solution = _both_ways(engine) if apart else _refined(engine)
+    solution = _both_ways(engine, meanwhile) if apart else _refined(engine, meanwhile)
     return settle_boards(engine, solution)
 
 
-def _refined(engine: Engine) -> BatchSolution:
+def _refined(engine: Engine, meanwhile: Meanwhile | None) -> BatchSolution:
     engine.state.values = engine.solver.settle()
-    return solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma)
+    return solve(engine.solver.log, engine.state.values, engine.rig.gates.robust_sigma, meanwhile)
 
 
-def _both_ways(engine: Engine) -> BatchSolution:
+def _both_ways(engine: Engine, meanwhile: Meanwhile | None) -> BatchSolution:
     """The batch solution needs no settled start; it only takes a few steps more."""
     solver = engine.solver
     running: Aside[tuple[gtsam.Values, int]] = Aside(apart=True, niceness=0)
     running.begin(lambda: (solver.settle(), len(solver.dropped)))
     try:
-        solution = solve(solver.log, solver.values(), engine.rig.gates.robust_sigma)
+        solution = solve(solver.log, solver.values(), engine.rig.gates.robust_sigma, meanwhile)
         values, dropped = running.awaited()
     except ObservabilityError:
-        return _refined(engine)  # which may give up landmarks that nothing determines, or tells what is missing
+        return _refined(
+            engine, meanwhile
+        )  # which may give up landmarks that nothing determines, or tells what is missing
     finally:
         running.stop()
     if dropped != len(solver.dropped):
-        return _refined(engine)
+        return _refined(engine, meanwhile)
     engine.state.values = solver.relocate(values, (), gtsam.Pose3())
     return solution
 
@@ -83,13 +89,17 @@ def finish(
     Raises:
         ObservabilityError: nothing ties the log together, or what was asked for is not determined by it.
     """
-    solution = solved(engine, apart)
-    engine.boards.inspection.doubled_in_images(rejected)
-    engine.rejected += rejected
-    engine.events += events
-    summary = Summary(engine, solution, apart)
-    remembered = partial(_memory, engine, solution) if memory else str
-    return summary.result(between, dict(timing or {}), dict(provenance or {}), remembered)
+    plain = PlainTests(engine, apart)
+    try:
+        solution = solved(engine, apart, plain.begin)
+        engine.boards.inspection.doubled_in_images(rejected)
+        engine.rejected += rejected
+        engine.events += events
+        remembered = partial(_memory, engine, solution) if memory else str
+        summary = Summary(engine, solution, plain, apart)
+        return summary.result(between, dict(timing or {}), dict(provenance or {}), remembered)
+    finally:
+        plain.stop()
 
 
 def _memory(engine: Engine, solution: BatchSolution) -> str:

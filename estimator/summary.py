@@ -20,14 +20,14 @@ from .aside import Aside
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
 from .calibration_rows import calibration_rows
-from .consistency import family_tests, judge, prior_tests
+from .consistency import judge
 from .engine import Engine
 from .known_distances import distance_name
-from .leave_out import without_families
 from .marker_points import parse_point
 from .motions import motions
 from .mount_check import compared_with_cloud
 from .pick_views import pick_records, pick_views
+from .plain_tests import Plain, PlainTests
 from .points_in_base import pipe_estimate, point_blocks, radius95
 from .refusals import everything_rejected
 from .result import (
@@ -41,11 +41,9 @@ from .result import (
     Result,
 )
 from .surroundings import Surroundings, compact_map, nearest_surface, surroundings
-from .trajectory import trajectory
+from .trajectory import with_covariances
 
 Float = NDArray[np.float64]
-LEFT_OUT = ("marker corners", "known distances", "depth cloud", "pipe cylinder", "pipe outline", "pipe width", "picks")
-"""Families without each of which there may still be an estimate to compare with."""
 MANY = "lxq"
 """Kinds of variables of which there are many: landmarks, keyframes, corners."""
 
@@ -54,7 +52,6 @@ MANY = "lxq"
 class _Rest:
     """Parts of a result that need no other but the points."""
 
-    trajectory: tuple[PoseEstimate, ...]
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
 
@@ -63,11 +60,13 @@ class Summary:
     """Reads one solution. Every covariance comes from the same linear system.
 
     Args:
+        plain: what may have begun before.
         apart: a copy of the process reads a part of it, where a second core is free.
     """
 
-    def __init__(self, engine: Engine, solution: BatchSolution, apart: bool = False) -> None:
+    def __init__(self, engine: Engine, solution: BatchSolution, plain: PlainTests, apart: bool = False) -> None:
         self._engine = engine
+        self._plain = plain
         self._apart = apart
         self._values = solution.values
         self._solution = solution
@@ -93,7 +92,8 @@ class Summary:
         rest: Aside[_Rest] = Aside(self._apart, niceness=0)
         rest.begin(lambda: self._rest(points))
         try:
-            consistency = self._consistency()
+            plain = self._plain.awaited(self._solution)
+            consistency = self._consistency(plain)
             distances = self._distances(between)
             self._tell_corner_rms()
             poses = self._poses()
@@ -101,13 +101,14 @@ class Summary:
             moved = motions(self._values, self._system, engine.odometry.keyframe_stamps)
             streaming = self._streaming_difference()
             remembered = memory()
+            path = with_covariances(plain.trajectory, engine.odometry, self._keyframe_covariances())
             other = rest.awaited()
         finally:
             rest.stop()
         return Result(
             points=points,
             poses=poses,
-            trajectory=other.trajectory,
+            trajectory=path,
             pipes=pipes,
             calibration=calibration,
             distances=distances,
@@ -131,7 +132,6 @@ class Summary:
     def _rest(self, points: tuple[PointEstimate, ...]) -> "_Rest":
         """Half of the work, of what changes nothing and is told to nobody before the end."""
         return _Rest(
-            trajectory(self._engine.odometry, self._values, self._keyframe_covariances()),
             self._advice(points),
             pick_views(self._engine, self._values, self._system),
         )
@@ -308,28 +308,14 @@ class Summary:
 
     # Consistency ----------------------------------------------------------------------------------------------
 
-    def _consistency(self) -> Consistency:
-        families = family_tests(self._solution.at)
-        tested = ("mount", "known distances", "board geometry", "calibration priors")
-        priors = prior_tests(self._active, self._system, tested)
-        paths = {t.record.what: t.sigma for t in priors if t.record.family in ("mount", "known distances")}
+    def _consistency(self, plain: Plain) -> Consistency:
+        paths = {t.record.what: t.sigma for t in plain.priors if t.record.family in ("mount", "known distances")}
         cylinders, ways = compared_with_cloud(self._engine, self._active, self._system, self._values)
-        without = self._left_out()
-        if (told := cloud_event(without, self._engine.end_ns)) is not None and "mount_wrong" not in self._told():
+        told = cloud_event(plain.without, self._engine.end_ns)
+        if told is not None and "mount_wrong" not in {event.kind for event in self._engine.events}:
             self._engine.events.append(told)
-        moved = {f"{point} without {family}": sigma for (point, family), sigma in without.items()}
-        return judge(families, [*priors, *cylinders], {**paths, **ways, **moved})
-
-    def _told(self) -> set[str]:
-        return {event.kind for event in self._engine.events}
-
-    def _left_out(self) -> dict[tuple[str, str], float]:
-        """How far each point moves without one family of measurements, in sigmas."""
-        known = [p for p in self._engine.pipes.points.values() if p.known]
-        if not known or not self._values.exists(self._engine.base):
-            return {}
-        blocks = {p.id: point_blocks(self._values, self._engine.base, keys.point(p.index))[1] for p in known}
-        return without_families(self._active, self._system, blocks, LEFT_OUT)
+        moved = {f"{point} without {family}": sigma for (point, family), sigma in plain.without.items()}
+        return judge(plain.families, [*plain.priors, *cylinders], {**paths, **ways, **moved})
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""

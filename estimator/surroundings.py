@@ -68,8 +68,7 @@ def _own_sigmas(system: LinearSystem, names: list[int]) -> Float:
     """Largest sigma of each landmark with everything else held, from its block of the information matrix."""
     if not names:
         return np.zeros(0)
-    information = (system.A.T @ system.A).tocsr()
-    diagonals = [information.diagonal(k) for k in range(3)]
+    diagonals = [system.information.diagonal(k) for k in range(3)]
     first = np.array([system.columns[key].start for key in names])
     blocks = np.zeros((len(names), 3, 3))
     for k in range(3):

@@ -1,5 +1,8 @@
 """The mobile camera's path: keyframes as the graph has them, and the frames in between."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -13,26 +16,38 @@ from .result import PoseEstimate
 Float = NDArray[np.float64]
 
 
-def trajectory(odometry: Odometry, values: gtsam.Values, covariances: list[Float]) -> tuple[PoseEstimate, ...]:
-    """Every frame's `o_T_m` in the order of time; keyframes have a covariance.
+def trajectory(odometry: Odometry, values: gtsam.Values) -> tuple[PoseEstimate, ...]:
+    """Every frame's `o_T_m` in the order of time.
 
     The front end's own motion since the last keyframe rests on nominal calibration and on points that one pair has
     measured; the map that the graph has made of many is several times better. Frames that have seen nothing lie between
     those that have.
-
-    Args:
-        covariances: of all keyframes, (6, 6) each, rotation first, body frame.
     """
     seen = [f.tracks.ids for f in odometry.frames if f.tracks is not None]
     known = Map.of(values, np.concatenate(seen) if seen else np.zeros(0, np.int64))
     frames = sorted(odometry.frames, key=lambda f: f.stamp_ns)
     placed = _bridged([f.stamp_ns for f in frames], _placed(frames, odometry, values, known))
-    poses = []
-    for frame, pose in zip(frames, placed, strict=True):
-        own = odometry.keyframe_stamps[frame.keyframe] == frame.stamp_ns
-        covariance = ros_covariance(pose, covariances[frame.keyframe]) if own else None
-        poses.append(PoseEstimate("m", "o", frame.stamp_ns, pose.matrix(), covariance))
-    return tuple(poses)
+    return tuple(
+        PoseEstimate("m", "o", frame.stamp_ns, pose.matrix(), None) for frame, pose in zip(frames, placed, strict=True)
+    )
+
+
+def with_covariances(
+    path: Sequence[PoseEstimate], odometry: Odometry, covariances: Sequence[Float]
+) -> tuple[PoseEstimate, ...]:
+    """Keyframes have one.
+
+    Args:
+        covariances: of all keyframes, (6, 6) each, rotation first, body frame.
+    """
+    own = dict(zip(odometry.keyframe_stamps, covariances, strict=True))
+    found = []
+    for pose in path:
+        covariance = own.get(pose.stamp_ns)
+        found.append(
+            pose if covariance is None else replace(pose, covariance=ros_covariance(pose3(pose.matrix), covariance))
+        )
+    return tuple(found)
 
 
 def _placed(frames: list[FramePose], odometry: Odometry, values: gtsam.Values, known: Map) -> list[gtsam.Pose3 | None]:

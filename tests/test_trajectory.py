@@ -7,7 +7,7 @@ import pytest
 from surecut.estimator.graph import State
 from surecut.estimator.odometry import FramePose, Odometry, OdometrySettings, SeenTracks
 from surecut.estimator.resection import Map, resected
-from surecut.estimator.trajectory import trajectory
+from surecut.estimator.trajectory import trajectory, with_covariances
 from surecut.factors import keys
 
 K = (250.0, 252.0, 0.0, 180.0, 120.0, 0.01, -0.002, 1e-4, -2e-4)
@@ -68,7 +68,7 @@ def test_frames_lie_on_the_map_and_blind_ones_between_their_neighbours() -> None
         FramePose(400, 1, np.eye(4)),
         FramePose(500, 1, np.eye(4)),
     ]
-    path = trajectory(odometry, values, [np.eye(6), np.eye(6)])
+    path = with_covariances(trajectory(odometry, values), odometry, [np.eye(6), np.eye(6)])
     assert [p.stamp_ns for p in path] == [0, 100, 250, 400, 500]
     assert [p.covariance is not None for p in path] == [True, False, False, True, False]
     assert path[1].matrix == pytest.approx(POSE.matrix(), abs=1e-4)
