@@ -37,7 +37,7 @@ class Aside(Generic[Made]):
         self._niceness = niceness
         self._pid = 0
         self._end = -1
-        self._said = b""
+        self._said = bytearray()
         self._result: list[Made | SurecutError] = []
 
     def busy(self) -> bool:
@@ -51,7 +51,7 @@ class Aside(Generic[Made]):
             self._result.append(_done(work))
             return
         self._end, theirs = os.pipe()
-        self._said = b""
+        self._said = bytearray()
         with warnings.catch_warnings():  # of other threads: the copy waits for nothing that they hold
             warnings.filterwarnings("ignore", ".*fork.*", DeprecationWarning)
             self._pid = os.fork()
@@ -129,6 +129,6 @@ def _copy(work: Callable[[], object], end: int, niceness: int) -> None:
         os._exit(0)  # no handlers, no buffers: they are the original's
 
 
-def _understood(said: bytes) -> Any:
+def _understood(said: bytearray) -> Any:
     """From our own copy: nothing that comes from outside is ever unpickled."""
     return pickle.loads(said) if said else SurecutError("a copy of the process died at its work; is there memory?")

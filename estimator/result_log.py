@@ -1,5 +1,6 @@
 """The result as an MCAP log of its own: poses, points, ellipsoids, diagnostics, and the whole result as attachment."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -29,11 +30,11 @@ Level = Literal["ok", "warn", "error", "stale"]
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
-def write_result(path: Path, result: Result, json: str | None = None) -> None:
+def write_result(path: Path, result: Result, json: Callable[[], str] | None = None) -> None:
     """Writes the log of estimates; it appears only when it is whole.
 
     Args:
-        json: the result as text, where it has been made already.
+        json: gives the result as text, where it is made elsewhere too; it is called last.
 
     Raises:
         LogError: the folder is missing, no permission, or the disk is full.
@@ -43,7 +44,7 @@ def write_result(path: Path, result: Result, json: str | None = None) -> None:
         _write_points(sink, result)
         _write_map(sink, result)
         _write_diagnostics(sink, result)
-        sink.attach("result.json", "application/json", json or to_json(result), result.end_ns)
+        sink.attach("result.json", "application/json", to_json(result) if json is None else json(), result.end_ns)
         sink.attach("rig.yaml", "application/yaml", result.config_yaml, result.end_ns)
         sink.metadata("run", {k: str(v) for k, v in result.provenance.items()})
 

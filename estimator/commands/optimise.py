@@ -4,6 +4,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -142,19 +143,30 @@ def _print(result: "Result") -> None:
     result_tables(result, Console())
 
 
-def _write(job: Job, result: "Result") -> None:
-    from ..output_files import write_text  # with libraries that need not be there before the front ends start
+def _write(job: Job, result: "Result", apart: bool = False) -> None:
+    """
+    Args:
+        apart: a copy of the process makes the text, which takes as long as the messages, where a second core is free.
+    """
+    from ..aside import Aside  # with libraries that need not be there before the front ends start
+    from ..output_files import write_text
     from ..result_json import to_json
     from ..result_log import tum_text, write_result
 
     for path in (job.output, job.json, job.tum):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-    text = to_json(result) if job.output is not None or job.json is not None else ""
-    if job.output is not None:
-        write_result(job.output, result, text)
-    if job.json is not None:
-        write_text(job.json, text)
+    made: Aside[str] = Aside(apart, niceness=0)
+    text = cache(made.awaited)
+    try:
+        if job.output is not None or job.json is not None:
+            made.begin(lambda: to_json(result))
+        if job.output is not None:
+            write_result(job.output, result, text)
+        if job.json is not None:
+            write_text(job.json, text())
+    finally:
+        made.stop()
     if job.tum is not None:
         write_text(job.tum, tum_text(result, job.frame))
 
@@ -165,7 +177,7 @@ def _with_progress(job: Job) -> "Result":
         result = _with_bar(job)
     else:
         result = optimise(job.log, job.rig, job.between, None, job.command, processes=PROCESSES)
-    _write(job, result)
+    _write(job, result, apart=True)
     return result
 
 
