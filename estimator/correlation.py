@@ -127,10 +127,7 @@ def _group_effect(
     worse of the two accounts counts, and `least` at least.
     """
     errors = found @ np.random.default_rng(1).normal(size=(len(system.b), DRAWS))
-    residuals = np.column_stack([system.b, system.residuals_of(errors)])
-    seen = tracks.gather(system, residuals).reshape(len(tracks.track), 4, -1)
-    own = seen.transpose(0, 2, 1) @ tracks.gather(system, influence).reshape(len(tracks.track), 4, -1)
-    whole = _summed(own, tracks.track)
+    whole = tracks.contributed(system, np.column_stack([system.b, system.residuals_of(errors)]), influence)
     ratios = [_contributed(whole)]
     ratios.append(float(np.mean([_contributed(_summed(whole, group)) for group in _parts(tracks, values)])))
     return max(*ratios, least)
@@ -298,6 +295,24 @@ class Tracks:
         for camera in range(2):
             own[self.seen[:, camera], camera] = residuals[self.rows(system, camera)]
         return own
+
+    def contributed(self, system: LinearSystem, residuals: Float, influence: Float) -> Float:
+        """What each whole track contributes to some quantities: shape (tracks, k, m).
+
+        Args:
+            residuals: (rows, k).
+            influence: how the quantities follow the whitened errors, (rows, m).
+        """
+        seen, moves = self.gather(system, residuals), self.gather(system, influence)
+        length = np.bincount(self.track)
+        first = np.cumsum(length) - length
+        found = np.empty((len(length), residuals.shape[1], influence.shape[1]))
+        for n in np.unique(length).tolist():
+            alike = np.flatnonzero(length == n)
+            entries = first[alike][:, None] + np.arange(n)
+            left = seen[entries].reshape(len(alike), 4 * n, -1).transpose(0, 2, 1)
+            found[alike] = left @ moves[entries].reshape(len(alike), 4 * n, -1)
+        return found
 
     def products(self, own: Float) -> tuple[Float, Float]:
         """Mean products of residuals (n, camera, axis, k) of one track, and of how many.

@@ -135,7 +135,8 @@ def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Flo
     dof = np.array([max(len(r) - LANDMARK, 1e-3) for r in rows])
     if covariance is None:
         return chi2, dof
-    followed = _followed(rows, system, place, covariance)
+    held = csr_matrix(system.A[:, np.flatnonzero(place >= 0)])
+    followed = _followed(rows, system, held, covariance)
     heavy = np.flatnonzero(followed > LIGHT * chi2)
     chi2 = chi2 + followed
     length = np.array([len(rows[i]) for i in heavy], dtype=np.int64)
@@ -143,31 +144,38 @@ def residuals_of_tracks(tracks: Views, system: LinearSystem) -> tuple[Float, Flo
         alike = heavy[length == n]
         for part in np.array_split(alike, -(-len(alike) * n * len(covariance) // AT_ONCE)):
             landmarks = np.array([np.arange(LANDMARK) + system.columns[tracks[i][0]].start for i in part])
-            chi2[part], dof[part] = _residuals(np.array([rows[i] for i in part]), landmarks, system, place, covariance)
+            chi2[part], dof[part] = _residuals(np.array([rows[i] for i in part]), landmarks, system, held, covariance)
     return chi2, dof
 
 
-def _followed(rows: list[Int], system: LinearSystem, place: Int, covariance: Float) -> Float:
-    """`r^T H r` of every track, shape (n,)."""
+def _followed(rows: list[Int], system: LinearSystem, held: csr_matrix, covariance: Float) -> Float:
+    """`r^T H r` of every track, shape (n,).
+
+    Args:
+        held: the columns of the system that are no landmark's.
+        covariance: of those unknowns.
+    """
     every = np.concatenate(rows)
     owner = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
     pull = csr_matrix((system.b[every], (owner, np.arange(len(every)))), shape=(len(rows), len(every)))
-    drawn = np.asarray((pull @ system.A[every])[:, np.flatnonzero(place >= 0)].todense())
+    drawn = np.asarray((pull @ held[every]).todense())
     return ((drawn @ covariance) * drawn).sum(axis=1)
 
 
-def _residuals(rows: Int, landmarks: Int, system: LinearSystem, place: Int, covariance: Float) -> tuple[Float, Float]:
+def _residuals(
+    rows: Int, landmarks: Int, system: LinearSystem, held: csr_matrix, covariance: Float
+) -> tuple[Float, Float]:
     """`z^T (I - H)^-1 z` (n,) of what is left of tracks' residuals when their landmarks are eliminated, and its
     dimension (n,).
 
     Args:
         rows: shape (n, m), of n tracks with as many measurements.
         landmarks: shape (n, 3), their columns.
-        place: of columns in the covariance, -1 for those that are not.
+        held: the columns that are no landmark's.
+        covariance: of those unknowns.
     """
     count, m = rows.shape
-    part = system.A[rows.ravel()]
-    B = part[:, np.flatnonzero(place >= 0)]
+    part, B = system.A[rows.ravel()], held[rows.ravel()]
     hat = (B @ covariance).reshape(count, m, -1) @ B.toarray().reshape(count, m, -1).transpose(0, 2, 1)
     i, j = np.arange(count * m).reshape(count, m, 1), landmarks[:, None, :]
     i, j = (index.ravel() for index in np.broadcast_arrays(i, j))
