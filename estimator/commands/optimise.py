@@ -176,9 +176,20 @@ def _with_progress(job: Job) -> "Result":
     if sys.stderr.isatty():
         result = _with_bar(job)
     else:
-        result = optimise(job.log, job.rig, job.between, None, job.command, processes=PROCESSES)
+        result = optimise(job.log, job.rig, job.between, lambda _: _load(), job.command, processes=PROCESSES)
     _write(job, result, apart=True)
     return result
+
+
+@cache
+def _load() -> None:
+    """What writes results takes a fifth of a second to load: at the first stamp the graph waits for the front ends."""
+    from rich import console, table  # noqa: F401
+
+    from ...io.schemas import typestore
+    from .. import result_json, result_log, tables  # noqa: F401
+
+    typestore()
 
 
 def _with_bar(job: Job) -> "Result":
@@ -198,6 +209,7 @@ def _with_bar(job: Job) -> "Result":
     task = bar.add_task(job.log.name, total=length)
 
     def advance(stamp_ns: int) -> None:
+        _load()
         bar.start()  # the bar has a thread, without which the front ends can be copies of this process
         bar.update(task, completed=min((stamp_ns - start) * 1e-9, length or float("inf")))
 
