@@ -50,9 +50,13 @@ class NormalEquations:
     def solve(self, right: Float) -> Float:
         """Right-hand sides (n, k) to solutions (n, k)."""
         x = np.empty((self._size, right.shape[1]))
-        own = right[self._leaf]
-        x[self._rest] = self._solve_rest(right[self._rest] - self._gain_T @ own)
-        x[self._leaf] = self._inverse @ own - self._gain @ x[self._rest]
+        own, rest = right[self._leaf], right[self._rest]
+        if not own.any():  # as where poses' covariances are wanted
+            rest = self._solve_rest(rest)
+            x[self._rest], x[self._leaf] = rest, -(self._gain @ rest)
+            return x
+        rest = self._solve_rest(rest - self._gain_T @ own)
+        x[self._rest], x[self._leaf] = rest, self._inverse @ own - self._gain @ rest
         return x
 
     def rest_inverse(self) -> tuple[Int, Float | None]:

@@ -52,6 +52,8 @@ MANY = "lxq"
 class _Rest:
     """Parts of a result that need no other but the points."""
 
+    keyframes: list[Float]
+    """Covariances (6, 6) of all keyframes, rotation first, body frame."""
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
 
@@ -101,8 +103,8 @@ class Summary:
             moved = motions(self._values, self._system, engine.odometry.keyframe_stamps)
             streaming = self._streaming_difference()
             remembered = memory()
-            path = with_covariances(plain.trajectory, engine.odometry, self._keyframe_covariances())
             other = rest.awaited()
+            path = with_covariances(plain.trajectory, engine.odometry, other.keyframes)
         finally:
             rest.stop()
         return Result(
@@ -132,6 +134,7 @@ class Summary:
     def _rest(self, points: tuple[PointEstimate, ...]) -> "_Rest":
         """Half of the work, of what changes nothing and is told to nobody before the end."""
         return _Rest(
+            self._keyframe_covariances(),
             self._advice(points),
             pick_views(self._engine, self._values, self._system),
         )
