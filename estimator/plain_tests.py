@@ -55,6 +55,7 @@ class PlainTests:
     def awaited(self, solution: BatchSolution) -> Plain:
         """Of a solution, whether it has begun or not."""
         if not self._running.busy() or self._of is not solution.values:
+            self._running.stop()
             return plain(self._engine, solution)
         return self._running.awaited()
 

@@ -1,9 +1,12 @@
 """Copies of the process that share the end of a run change nothing about it; the optimum is found either way."""
 
+from types import SimpleNamespace
+
 import gtsam
 import numpy as np
 import pytest
 
+from surecut.estimator import plain_tests
 from surecut.estimator.aside import Aside
 from surecut.estimator.bundle import bundles
 from surecut.estimator.engine import Engine
@@ -51,6 +54,18 @@ def test_the_result_of_a_copy_is_waited_for(apart):
     aside.begin(fails)
     with pytest.raises(ObservabilityError, match="nothing ties it"):
         aside.awaited()
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_what_has_begun_counts_for_its_own_solution_only(apart, monkeypatch):
+    monkeypatch.setattr(plain_tests, "plain", lambda engine, solution: solution.name)
+    first, last = (SimpleNamespace(name=name, values=object()) for name in ("first", "last"))
+    tests = plain_tests.PlainTests(SimpleNamespace(), apart)
+    for begun in ((first,), (last,), (first, last), ()):
+        for solution in begun:
+            tests.begin(solution)
+        assert tests.awaited(last) == "last"
+        tests.stop()
 
 
 def test_where_a_full_step_makes_it_worse_a_damped_one_does_not():
