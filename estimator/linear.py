@@ -117,7 +117,10 @@ class LinearSystem:
 
     def solve(self, right: Float) -> Float:
         """`(A^T A)^-1 right`, right of shape (n, k)."""
-        return self._normal.solve(right)
+        if right.shape[1] <= CHUNK:
+            return self._normal.solve(right)
+        parts = range(0, right.shape[1], CHUNK)
+        return np.hstack([self._normal.solve(np.ascontiguousarray(right[:, at : at + CHUNK])) for at in parts])
 
     def residuals_of(self, errors: Float) -> Float:
         """What the adjustment leaves of errors of the measurements, both (rows, k)."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -88,12 +89,12 @@ class Summary:
         """
         engine = self._engine
         points = self._points()
-        pipes = self._pipes(points)
-        around = surroundings(engine, self._values, self._system)
-        points = tuple(self._with_surface(p, pipes, around) for p in points)
         rest: Aside[_Rest] = Aside(self._apart, niceness=0)
-        rest.begin(lambda: self._rest(points))
+        rest.begin(partial(self._rest, points))
         try:
+            pipes = self._pipes(points)
+            around = surroundings(engine, self._values, self._system)
+            points = tuple(self._with_surface(p, pipes, around) for p in points)
             plain = self._plain.awaited(self._solution)
             consistency = self._consistency(plain)
             distances = self._distances(between)
