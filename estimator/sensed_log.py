@@ -25,6 +25,7 @@ import numpy as np
 from ..factors.errors import SurecutError
 from ..factors.rig import Rig
 from ..io.reader import LogReader
+from .passage import ROOM_BYTES, Passage
 from .sensed_here import RecordingReport, SensedHere, SensedLog
 from .threads import single_threaded_children
 
@@ -77,8 +78,8 @@ class SensedElsewhere:
         self._log, self._rig = log, rig
         self._processes: list[BaseProcess] = []
         self._context: Any = None
-        self._followed: Any = None
-        self._sensed: Any = None
+        self._followed: Passage
+        self._sensed: Passage
 
     @property
     def report(self) -> RecordingReport:
@@ -87,7 +88,8 @@ class SensedElsewhere:
     def __enter__(self) -> Self:
         forks = may_fork()
         self._context = multiprocessing.get_context("fork" if forks else "spawn")
-        self._followed, self._sensed = self._context.Queue(AHEAD), self._context.Queue(AHEAD)
+        room_bytes = ROOM_BYTES if forks else 0
+        self._followed, self._sensed = (Passage(self._context, AHEAD, room_bytes) for _ in range(2))
         if forks:
             importlib.import_module(".sensing", __package__)  # here, for all processes
         self._start(_follow, self._log, self._rig, self._followed)
@@ -146,7 +148,7 @@ def may_fork() -> bool:
     return len([*tasks.iterdir()]) == 1
 
 
-def _follow(log: Path, rig: Rig, out: Any) -> None:
+def _follow(log: Path, rig: Rig, out: Passage) -> None:
     """The first process: reads, and follows the mobile camera."""
     from .items import wanted_topics
     from .sensing import Sensing
@@ -169,7 +171,7 @@ def _follow(log: Path, rig: Rig, out: Any) -> None:
         out.put(_End(report(), defect=traceback.format_exc()))
 
 
-def _look(rig: Rig, followed: Any, out: Any) -> None:
+def _look(rig: Rig, followed: Passage, out: Passage) -> None:
     """The second process: everything else that can be seen."""
     from .sensing import Sensing, SensingReport
 

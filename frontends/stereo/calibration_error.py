@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .geometry import Float, StereoGeometry, inverse, project, projection_jacobian, transform
+from .geometry import Float, StereoGeometry
 from .settings import StereoSettings
 
 
@@ -22,18 +22,22 @@ def of_calibration(
         rig: nominal geometry; both cameras err alike.
         settings: with the calibration's sigmas.
     """
-    camera = rig.left
-    centre = np.array([camera.cx, camera.cy])
-    here = transform(inverse(reference_T_this), points)
-    here[:, 2] = np.maximum(here[:, 2], 1e-3)
-    by_point = projection_jacobian(here, camera) @ reference_T_this[:3, :3].T
-    carried = by_point[:, :, :2] * (points[:, 2] / camera.fx)[:, None, None]
-    """Derivative (n, 2, 2) of pixels in this frame by those in the reference's."""
-    reference = project(points, camera) - centre
-    by_focal = px[:, :2] - centre - np.einsum("nij,nj->ni", carried, reference)
-    by_centre = np.eye(2) - carried
-    both = np.concatenate(
-        (settings.focal_sigma_rel * by_focal[:, :, None], settings.centre_sigma_px * by_centre), axis=2
-    )
-    both = np.nan_to_num(np.concatenate((both, both), axis=1))
-    return both @ both.transpose(0, 2, 1)
+    camera, n = rig.left, len(points)
+    focal = np.array([[camera.fx], [camera.fy]])
+    centre = np.array([[camera.cx], [camera.cy]])
+    turn = reference_T_this[:3, :3].T[:, :, None]
+    here = reference_T_this[:3, :3].T @ (points.T - reference_T_this[:3, 3:])
+    depth = np.maximum(here[2], 1e-3)
+    plane = here[:2] / depth
+    carried = (turn[:2, :2] - plane[:, None] * turn[2, :2]) * (points[:, 2] / (camera.fx * depth) * focal)[:, None]
+    """Derivative (2, 2, n) of pixels in this frame by those in the reference's."""
+    ahead = np.where(points[:, 2] > 1e-6, points[:, 2], np.nan)
+    reference = focal * points[:, :2].T / ahead
+    both = np.empty((2, 3, n))
+    both[:, 0] = settings.focal_sigma_rel * (px[:, :2].T - centre - (carried * reference).sum(axis=1))
+    both[:, 1:] = settings.centre_sigma_px * (np.eye(2)[:, :, None] - carried)
+    both[np.isnan(both)] = 0.0
+    one = (both[:, None] * both).sum(axis=2)
+    covariance = np.empty((n, 2, 2, 2, 2))  # of left or right, u or v, with left or right, u or v
+    covariance[:] = one.transpose(2, 0, 1)[:, None, :, None, :]
+    return covariance.reshape(n, 4, 4)

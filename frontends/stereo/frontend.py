@@ -207,17 +207,19 @@ class StereoFrontEnd:
         """Motion since the last keyframe; tracks that do not follow it get strikes. None without a sound consensus."""
         tracks = self._tracks
         usable = np.isfinite(tracks.points).all(axis=1) & np.isfinite(px[:, :2]).all(axis=1)
+        of_points = tracks.points, tracks.points_covariance, px, covariance
+        points, points_covariance, px, covariance = of_points if usable.all() else (a[usable] for a in of_points)
         motion = estimate_motion(
-            tracks.points[usable],
-            tracks.points_covariance[usable],
-            px[usable],
-            covariance[usable],
+            points,
+            points_covariance,
+            px,
+            covariance,
             (guess, self._keyframe_T_last),
             self.rig,
             self.settings.min_inliers,
-            of_calibration(tracks.points[usable], px[usable], guess, self.rig, self.settings),
+            of_calibration(points, px, guess, self.rig, self.settings),
         )
-        if motion is None or least_spread(px[usable][motion.inliers, :2]) < self.settings.min_spread * self._diagonal:
+        if motion is None or least_spread(px[motion.inliers, :2]) < self.settings.min_spread * self._diagonal:
             return None
         strikes = np.zeros(len(tracks), dtype=np.int64)
         strikes[usable] = np.where(motion.inliers, 0, 1 + (motion.chi2 > 60.0))
