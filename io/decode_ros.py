@@ -1,5 +1,6 @@
 """ROS 2 messages (CDR), decoded by the definition that the log carries."""
 
+import struct
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -43,6 +44,8 @@ RosMessage = Any
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MAXIMUM_MESSAGE = 1 << 30
+_STAMP_END = 12
+"""A message begins with its encoding, four bytes, and where it has a header, with seconds and nanoseconds of four."""
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
@@ -81,7 +84,27 @@ def ros_decoder(channel: ChannelInfo) -> Decoder:
             raise DecodeError(f"{where}: the data is no {name} ({in_one_line(error)})") from error
         return Message(topic, log_time_ns, stamp_ns, frame_id, body)
 
-    return decode
+    return _once(decode) if has_header and make is _camera_info else decode
+
+
+def _once(decode: Decoder) -> Decoder:
+    """Decodes a message that repeats the last one but for its stamp no second time, as calibrations do."""
+    last = b""
+    known: Message | None = None
+
+    def decode_new(data: Bytes, log_time_ns: int) -> Message:
+        nonlocal last, known
+        if known is not None and data[:4] == last[:4] and data[_STAMP_END:] == last[_STAMP_END:]:
+            seconds, nanoseconds = struct.unpack_from("<iI" if data[1] else ">iI", data, 4)
+            stamp_ns = seconds * 1_000_000_000 + nanoseconds
+            return Message(known.topic, log_time_ns, stamp_ns, known.frame_id, known.body)
+        known = None
+        message = decode(data, log_time_ns)
+        if data[0] == 0:  # else it is compressed
+            last, known = bytes(data), message
+        return message
+
+    return decode_new
 
 
 def full_name(name: str) -> str:

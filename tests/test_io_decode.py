@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+from dataclasses import replace
 
 import cv2
 import logmaker
@@ -22,7 +23,7 @@ from surecut.io import build
 from surecut.io.decode import ChannelInfo, DecodeError, decoder_for
 from surecut.io.messages import CameraInfoBody, CloudBody, DepthBody, ImageBody, JsonBody, PoseBody
 from surecut.io.pixels import CompressedPixels, PixelError, RawPixels, to_depth_m, to_uint8
-from surecut.io.schemas import schema
+from surecut.io.schemas import schema, typestore
 
 RGB = np.array([[[10, 20, 30], [40, 50, 60]], [[70, 80, 90], [100, 110, 120]]], np.uint8)
 
@@ -188,6 +189,25 @@ def test_foxglove_protobuf_images_and_depth():
     body = foxglove(CompressedImage)(stamped(CompressedImage(format="png", data=png)).SerializeToString(), 1).body
     assert isinstance(body, ImageBody)
     assert np.array_equal(body.pixels(), picture)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_calibrations_that_differ_are_told_apart_and_each_has_its_own_stamp(big):
+    def info(stamp_ns: int, K: np.ndarray = logmaker.LEFT.K) -> bytes:
+        message = build.camera_info(stamp_ns, "cam", replace(logmaker.LEFT, K=K))
+        return bytes(typestore().serialize_cdr(message, kind, little_endian=not big))
+
+    kind = "sensor_msgs/msg/CameraInfo"
+    decode, other = ros(kind), logmaker.LEFT.K.copy()
+    other[0, 0] += 1e-9
+    sent = [(TIME, logmaker.LEFT.K), (TIME + 7, logmaker.LEFT.K), (TIME, other), (TIME - 1, logmaker.LEFT.K)]
+    for stamp_ns, K in sent:
+        message = decode(info(stamp_ns, K), 1)
+        assert isinstance(message.body, CameraInfoBody)
+        assert (message.stamp_ns, message.frame_id, message.log_time_ns) == (stamp_ns, "cam", 1)
+        assert message.body.camera.K.tolist() == K.tolist()
+    with pytest.raises(DecodeError):
+        decode(info(TIME)[:60], 1)
 
 
 def test_foxglove_protobuf_calibration_pose_and_cloud():

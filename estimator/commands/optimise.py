@@ -12,6 +12,7 @@ import typer
 
 from ...factors.errors import SurecutError
 from ...io.reader import LogReader
+from ..freed_memory import keep_freed_memory
 from ..optimise import optimise
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def command(
     if resume:
         work = [job for job in work if not _done(job)]
     if not several:
+        keep_freed_memory()
         for job in work:
             result = _with_progress(job)
             _print(result)
