@@ -70,7 +70,14 @@ def points_of(update: dict) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def difference(before: dict, after: dict) -> float:
-    return max((float((np.abs(after[n][0] - p) / s).max()) for n, (p, s) in before.items() if n in after), default=0.0)
+    """Of two answers' points in sigmas of the less certain answer: what was learned since the last checkpoint is lost,
+    so that the later one knows less."""
+    found = [
+        float((np.abs(after[n][0] - p) / np.maximum(after[n][1], s)).max())
+        for n, (p, s) in before.items()
+        if n in after
+    ]
+    return max(found, default=0.0)
 
 
 def true_points(log: Path) -> dict[str, np.ndarray]:

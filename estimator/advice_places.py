@@ -106,7 +106,7 @@ class Places:
         used = {c.key for c in views}
         furthest = max((float(np.linalg.norm(c.o_T_c.translation() - o_p)) for c in views), default=1.5)
         found: list[tuple[float, Place, int]] = []
-        for i, stamp_ns in enumerate(self._engine.odometry.keyframe_stamps):
+        for i, stamp_ns in self._engine.odometry.keyframes_in(scene.values).items():
             pose = scene.values.atPose3(keys.keyframe(i))
             away = float(np.linalg.norm(pose.translation() - o_p))
             if keys.keyframe(i) in used or away > 1.5 * furthest or not scene.pixels("m_left", pose, o_p[None])[1][0]:
@@ -140,10 +140,9 @@ class Places:
     def between(self, o_T_rgb: gtsam.Pose3) -> tuple[View, gtsam.Pose3, str] | None:
         """A place for a further board that the Kinect's colour camera and a keyframe's place both look at."""
         scene = self._scene
-        count = len(self._engine.odometry.keyframe_stamps)
-        eyes = [
-            scene.values.atPose3(keys.keyframe(i)) for i in range(0, count, max(1, count // PLACES_PER_SECOND_BOARD))
-        ]
+        there = [*self._engine.odometry.keyframes_in(scene.values)]
+        some = there[:: max(1, len(there) // PLACES_PER_SECOND_BOARD)]
+        eyes = [scene.values.atPose3(keys.keyframe(i)) for i in some]
         options = []
         for x in (0.0, -0.35, 0.35):
             for z in (1.2, 1.6):

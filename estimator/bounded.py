@@ -5,6 +5,7 @@ does not grow with the time that the run has taken.
 """
 
 from collections import Counter
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import gtsam
@@ -27,6 +28,8 @@ class Bounded:
 
     engine: Engine
     limits: Limits = field(default_factory=Limits)
+    leaving: Callable[[Collection[int]], object] = lambda keyframes: None
+    """Told of keyframes, by index, while the engine has them still."""
     first: int = 0
     """Index of the oldest keyframe in the graph."""
     refused: Counter[str] = field(default_factory=Counter)
@@ -71,6 +74,7 @@ class Bounded:
         poses = self._poses(first)
         if not poses:
             return
+        self.leaving({keys.index(k) for k in poses})
         landmarks = self._landmarks_of(poses)
         cut = self._reduced(Cut(poses | landmarks.gone, landmarks.lonely, landmarks.split))
         self.refused_landmarks(cut.dropped)

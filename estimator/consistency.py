@@ -10,6 +10,7 @@ from ..factors.chance import chi2_cdf, chi2_ppf, normal_isf
 from .graph import Record
 from .linear import LinearSystem, deviate
 from .linearised import Linearised
+from .marginal import FAMILY as EARLIER
 from .result import Consistency, FamilyConsistency
 
 Float = NDArray[np.float64]
@@ -35,13 +36,18 @@ class PriorTest:
 
 
 def family_tests(at: Linearised) -> tuple[FamilyConsistency, ...]:
-    """Chi-square of every family of measurements that has degrees of freedom to spare."""
+    """Chi-square of every family of measurements that has degrees of freedom to spare.
+
+    What keyframes left that are gone is no measurement: its errors are those of many that were weighed before.
+    """
     system = at.system
     families = sorted({r.family for _, _, r in at.active})
     group = np.array([families.index(r.family) for _, _, r in at.active])
     shares = system.leverage(group, len(families))
     tests = []
     for g, family in enumerate(families):
+        if family == EARLIER:
+            continue
         norms, rows = at.norms[group == g], system.rows[group == g]
         dof = max(float(rows.sum() - shares[g]), 0.0)
         soft = int((norms > 3.0 * np.sqrt(rows)).sum())

@@ -12,6 +12,7 @@ from ..factors.noise import robust_scale
 from .correlation import Active, correlate
 from .graph import FactorLog
 from .linear import LinearSystem
+from .marginal import FAMILY as EARLIER
 
 Float = NDArray[np.float64]
 
@@ -100,6 +101,9 @@ def settled(at: Linearised, robust_sigma: float) -> tuple[Linearised, float]:
 def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> Linearised:
     """The same with covariances that know that the errors of a family's tracks are correlated.
 
+    What keyframes left that are gone is mostly made of tracks and cannot be told apart any more: it is widened as they
+    are on average.
+
     Args:
         slack: what the estimate's variances are over those of weights known beforehand (`track_weights`). What the
             tracks contribute is smaller by as much, so that it enters squared beside an account of contributions.
@@ -107,8 +111,8 @@ def with_correlated_tracks(at: Linearised, family: str, slack: float = 1.0) -> L
     found = correlate(at.active, at.values, at.system, family, 1.0 / slack)
     if found is None and slack == 1.0:
         return at
-    mine = np.repeat([record.family == family for _, _, record in at.active], at.system.rows)
-    own = csr_matrix(diags(np.where(mine, np.sqrt(slack) if found is None else slack, 1.0)))
-    at.system.root = own if found is None else csr_matrix(own @ found.root)
     inflation = slack if found is None else found.inflation * slack**2
+    wider = {family: np.sqrt(slack) if found is None else slack, EARLIER: np.sqrt(max(inflation, 1.0))}
+    own = csr_matrix(diags(np.repeat([wider.get(record.family, 1.0) for _, _, record in at.active], at.system.rows)))
+    at.system.root = own if found is None else csr_matrix(own @ found.root)
     return replace(at, inflation=inflation)

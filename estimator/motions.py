@@ -1,6 +1,6 @@
 """How the mobile camera moved from second to second, with covariances from the joint of both keyframes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -18,7 +18,7 @@ MOST = 60
 """Windows of one result, evenly spread: a sample tells as much about the covariances as all of an hour's."""
 
 
-def motions(values: gtsam.Values, system: LinearSystem, stamps_ns: Sequence[int]) -> tuple[MotionEstimate, ...]:
+def motions(values: gtsam.Values, system: LinearSystem, keyframes: Mapping[int, int]) -> tuple[MotionEstimate, ...]:
     """Motions between keyframes that are a second apart or a little more, one after the other.
 
     Their covariances are from the joint of both poses: errors that they share cancel in the motion between them.
@@ -26,12 +26,13 @@ def motions(values: gtsam.Values, system: LinearSystem, stamps_ns: Sequence[int]
     Args:
         values: the estimate.
         system: its linear system.
-        stamps_ns: of all keyframes, in the order of their keys.
+        keyframes: index and stamp, ns, of those in the estimate.
     """
+    index, stamps_ns = [*keyframes], [*keyframes.values()]
     pairs = windows(stamps_ns)
     if len(pairs) > MOST:
         pairs = [pairs[i] for i in np.linspace(0, len(pairs) - 1, MOST).round().astype(int)]
-    ends = [(keys.keyframe(first), keys.keyframe(last)) for first, last in pairs]
+    ends = [(keys.keyframe(index[first]), keys.keyframe(index[last])) for first, last in pairs]
     covariances = system.covariances([motion_blocks(values, before, after) for before, after in ends])
     found = []
     for (first, last), (before, after), covariance in zip(pairs, ends, covariances, strict=True):

@@ -108,6 +108,10 @@ class Odometry:
         """Index of the newest keyframe, -1 before the first."""
         return len(self.keyframe_stamps) - 1
 
+    def keyframes_in(self, values: gtsam.Values) -> dict[int, int]:
+        """Index and stamp (ns) of the keyframes that an estimate holds; others have left the graph."""
+        return {i: at for i, at in enumerate(self.keyframe_stamps) if values.exists(keys.keyframe(i))}
+
     @property
     def lost_speed_m_s(self) -> float:
         """Standard deviation of the velocity while nothing is tracked."""

@@ -62,12 +62,15 @@ def optimise(
         rig = rig_of(reader, rig_file)
     with opened(log, rig, processes) as recording, told_of(log, recording):
         from .depth_run import depth_alone, depth_result  # the graph's libraries load while the front ends start
+        from .long_recording import LongRecording
         from .pipeline import Pipeline
         from .run import finish
 
         pipeline = Pipeline(rig, together=TOGETHER)
+        long = LongRecording(pipeline.engine)
         with watch("run"):
             for stamp_ns in pipeline.run(recording):
+                long.tidy()
                 if progress is not None:
                     progress(stamp_ns)
             report = recording.report
@@ -90,6 +93,7 @@ def optimise(
                 report.sensing.rejected,
                 odd,
                 memory=True,
+                past=long.past,
                 apart=processes > 1,
             )
 

@@ -16,7 +16,7 @@ from .bundle import bundles
 from .engine import Engine
 from .pipe_tracks import widen_pipe_tracks
 from .plain_tests import PlainTests
-from .result import Result
+from .result import PoseEstimate, Result
 from .summary import Summary
 from .surfaces import Associator
 
@@ -78,12 +78,14 @@ def finish(
     rejected: Sequence[Rejection] = (),
     events: Sequence[Event] = (),
     memory: bool = False,
+    past: Sequence[PoseEstimate] = (),
     apart: bool = False,
 ) -> Result:
     """Settles iSAM2, refines in batch over the same factors, and reads the result.
 
     Args:
         memory: a later run may begin with the result.
+        past: the path of keyframes that have left the graph.
         apart: copies of the process do a part of the work, where a second core is free.
 
     Raises:
@@ -96,7 +98,7 @@ def finish(
         engine.rejected += rejected
         engine.events += events
         remembered = partial(_memory, engine, solution) if memory else str
-        summary = Summary(engine, solution, plain, apart)
+        summary = Summary(engine, solution, plain, past, apart)
         return summary.result(between, dict(timing or {}), dict(provenance or {}), remembered)
     finally:
         plain.stop()

@@ -1,6 +1,6 @@
 """From the solved graph to the `Result`: points in {b}, poses, calibration, distances, consistency, provenance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -53,8 +53,8 @@ MANY = "lxq"
 class _Rest:
     """Parts of a result that need no other but the points."""
 
-    keyframes: list[Float]
-    """Covariances (6, 6) of all keyframes, rotation first, body frame."""
+    keyframes: dict[int, Float]
+    """Covariances (6, 6) of keyframes by stamp, ns, rotation first, body frame."""
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
 
@@ -64,12 +64,21 @@ class Summary:
 
     Args:
         plain: what may have begun before.
+        past: the path of keyframes that have left the graph.
         apart: a copy of the process reads a part of it, where a second core is free.
     """
 
-    def __init__(self, engine: Engine, solution: BatchSolution, plain: PlainTests, apart: bool = False) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        solution: BatchSolution,
+        plain: PlainTests,
+        past: Sequence[PoseEstimate] = (),
+        apart: bool = False,
+    ) -> None:
         self._engine = engine
         self._plain = plain
+        self._past = past
         self._apart = apart
         self._values = solution.values
         self._solution = solution
@@ -101,17 +110,17 @@ class Summary:
             self._tell_corner_rms()
             poses = self._poses()
             calibration = calibration_rows(engine, self._values, self._sigmas)
-            moved = motions(self._values, self._system, engine.odometry.keyframe_stamps)
+            moved = motions(self._values, self._system, engine.odometry.keyframes_in(self._values))
             streaming = self._streaming_difference()
             remembered = memory()
             other = rest.awaited()
-            path = with_covariances(plain.trajectory, engine.odometry, other.keyframes)
+            path = (*self._past, *with_covariances(plain.trajectory, other.keyframes))
         finally:
             rest.stop()
         return Result(
             points=points,
             poses=poses,
-            trajectory=path,
+            trajectory=tuple(sorted(path, key=lambda pose: pose.stamp_ns)),
             pipes=pipes,
             calibration=calibration,
             distances=distances,
@@ -258,10 +267,10 @@ class Summary:
             found.append(PoseEstimate(name, "o", stamp_ns, pose.matrix(), ros_covariance(pose, covariance)))
         return tuple(found)
 
-    def _keyframe_covariances(self) -> list[Float]:
-        """All keyframes' own covariances, shape (6, 6) each, rotation first, body frame."""
-        count = self._engine.odometry.last_keyframe + 1
-        return self._system.marginals([keys.keyframe(i) for i in range(count)])
+    def _keyframe_covariances(self) -> dict[int, Float]:
+        """Keyframes' own covariances by stamp, ns, shape (6, 6) each, rotation first, body frame."""
+        there = self._engine.odometry.keyframes_in(self._values)
+        return dict(zip(there.values(), self._system.marginals([keys.keyframe(i) for i in there]), strict=True))
 
     # Distances ------------------------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """The mobile camera's path: keyframes as the graph has them, and the frames in between."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 import gtsam
@@ -16,34 +16,37 @@ from .result import PoseEstimate
 Float = NDArray[np.float64]
 
 
-def trajectory(odometry: Odometry, values: gtsam.Values) -> tuple[PoseEstimate, ...]:
+def trajectory(
+    odometry: Odometry, values: gtsam.Values, only: Collection[int] | None = None
+) -> tuple[PoseEstimate, ...]:
     """Every frame's `o_T_m` in the order of time.
 
     The front end's own motion since the last keyframe rests on nominal calibration and on points that one pair has
     measured; the map that the graph has made of many is several times better. Frames that have seen nothing lie between
     those that have.
+
+    Args:
+        only: keyframes, by index, whose frames are meant; None: all.
     """
-    seen = [f.tracks.ids for f in odometry.frames if f.tracks is not None]
+    meant = [f for f in odometry.frames if only is None or f.keyframe in only]
+    seen = [f.tracks.ids for f in meant if f.tracks is not None]
     known = Map.of(values, np.concatenate(seen) if seen else np.zeros(0, np.int64))
-    frames = sorted(odometry.frames, key=lambda f: f.stamp_ns)
+    frames = sorted(meant, key=lambda f: f.stamp_ns)
     placed = _bridged([f.stamp_ns for f in frames], _placed(frames, odometry, values, known))
     return tuple(
         PoseEstimate("m", "o", frame.stamp_ns, pose.matrix(), None) for frame, pose in zip(frames, placed, strict=True)
     )
 
 
-def with_covariances(
-    path: Sequence[PoseEstimate], odometry: Odometry, covariances: Sequence[Float]
-) -> tuple[PoseEstimate, ...]:
+def with_covariances(path: Iterable[PoseEstimate], covariances: Mapping[int, Float]) -> tuple[PoseEstimate, ...]:
     """Keyframes have one.
 
     Args:
-        covariances: of all keyframes, (6, 6) each, rotation first, body frame.
+        covariances: of keyframes, (6, 6) each, rotation first, body frame, by stamp, ns.
     """
-    own = dict(zip(odometry.keyframe_stamps, covariances, strict=True))
     found = []
     for pose in path:
-        covariance = own.get(pose.stamp_ns)
+        covariance = covariances.get(pose.stamp_ns)
         found.append(
             pose if covariance is None else replace(pose, covariance=ros_covariance(pose3(pose.matrix), covariance))
         )

@@ -68,7 +68,7 @@ def test_frames_lie_on_the_map_and_blind_ones_between_their_neighbours() -> None
         FramePose(400, 1, np.eye(4)),
         FramePose(500, 1, np.eye(4)),
     ]
-    path = with_covariances(trajectory(odometry, values), odometry, [np.eye(6), np.eye(6)])
+    path = with_covariances(trajectory(odometry, values), dict.fromkeys(odometry.keyframe_stamps, np.eye(6)))
     assert [p.stamp_ns for p in path] == [0, 100, 250, 400, 500]
     assert [p.covariance is not None for p in path] == [True, False, False, True, False]
     assert path[1].matrix == pytest.approx(POSE.matrix(), abs=1e-4)

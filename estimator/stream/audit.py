@@ -65,8 +65,7 @@ def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, se
 
 
 def audit(engine: Engine) -> Audit:
-    """Takes as long as a batch refinement after its first optimum. What earlier keyframes left is widened like tracks
-    are: it is mostly made of them, and cannot be told apart any more; corners by what their residuals show.
+    """Takes as long as a batch refinement after its first optimum. Corners are widened by what their residuals show.
 
     The running estimate has outliers in it, with little weight; whether the model holds is for the others to say.
     """
@@ -75,8 +74,8 @@ def audit(engine: Engine) -> Audit:
     plain = linearise(log, off, values, robust_sigma)
     at = with_correlated_tracks(plain, ODOMETRY)
     system = at.system
-    variances = {FAMILY: at.inflation, CORNERS: corner_variance(at)}
-    wider = np.repeat([np.sqrt(variances.get(record.family, 1.0)) for _, _, record in at.active], system.rows)
+    corners = np.sqrt(corner_variance(at))
+    wider = np.repeat([corners if record.family == CORNERS else 1.0 for _, _, record in at.active], system.rows)
     system.root = csr_matrix(diags(wider) if system.root is None else diags(wider) @ system.root)
     priors = prior_tests(at.active, system, TESTED)
     widening = _widening(engine, system, values)
@@ -92,7 +91,7 @@ def _families(log: FactorLog, off: set[int], at: Linearised, robust_sigma: float
     at = _weighed(
         at, {**track_weights(at.active, at.system, ODOMETRY).by_position, **weights(at, variance)}, robust_sigma
     )
-    return tuple(f for f in family_tests(as_stated(at, variance)) if f.family != FAMILY)
+    return family_tests(as_stated(at, variance))
 
 
 def _weighed(at: Linearised, by_position: Mapping[int, float], robust_sigma: float) -> Linearised:
