@@ -106,8 +106,10 @@ def test_time_is_data(package):
 
 
 def test_every_package_is_listed():
+    """Folders of scenarios too: setuptools warns at every installation otherwise."""
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
-    folders = {path.parent.relative_to(ROOT) for package in MAY_IMPORT for path in files(package)}
+    scenarios = list((ROOT / "simulation").rglob("*.yaml"))
+    folders = {path.parent.relative_to(ROOT) for package in MAY_IMPORT for path in [*files(package), *scenarios]}
     expected = {"surecut." + ".".join(folder.parts): str(folder) for folder in folders}
     assert set(setuptools["packages"]) == set(expected)
     assert setuptools["package-dir"] == expected
