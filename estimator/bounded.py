@@ -20,6 +20,7 @@ from .linearised import linearise
 from .marginal import FAMILY
 from .observability import Undetermined
 from .refusals import lists_of_rejections
+from .run_away import run_away
 
 
 @dataclass(slots=True)
@@ -113,8 +114,8 @@ class Bounded:
         engine.rejected += [told for _, told in mine]
 
     def _landmarks_of(self, poses: set[int]) -> "_Landmarks":
-        """Landmarks that only these keyframes saw: those that go, and those without views enough to be points,
-        wherever these are."""
+        """Landmarks that only these keyframes saw: those that go, and those without views enough to be points, or
+        that have run away, wherever these are."""
         inside: Counter[int] = Counter()
         outside: Counter[int] = Counter()
         every: set[int] = set()
@@ -134,9 +135,10 @@ class Bounded:
         lonely = {k for k in every - bound if inside[k] + outside[k] < MINIMUM_VIEWS}
         lonely |= {k for k in seen if inside[k] < MINIMUM_VIEWS}
         lonely |= {k for k in self.engine.state.values.keys() if keys.kind(k) == "l" and k not in every}
+        lonely |= run_away(self.engine.state)
         views = self.engine.odometry.observations
         known = sorted(seen - lonely, key=lambda k: -views.get(keys.index(k), 0))
-        both = [k for k in every - seen if inside[k] >= MINIMUM_VIEWS and k not in bound]
+        both = [k for k in every - seen - lonely if inside[k] >= MINIMUM_VIEWS and k not in bound]
         both.sort(key=lambda k: -(inside[k] * outside[k]))
         split = {k for k in both[self.limits.shared_landmarks :] if outside[k] >= MINIMUM_VIEWS}
         return _Landmarks(set(known[self.limits.map_landmarks :]), lonely, split)

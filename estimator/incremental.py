@@ -13,6 +13,7 @@ from .graph import FactorLog, Record, Update
 from .marginal import FAMILY, GaussianPrior, carried, gaussian_of, joint_of, marginal, renamed, without
 from .newton import Elimination, gain
 from .observability import Undetermined, determined
+from .run_away import blamed
 
 Float = NDArray[np.float64]
 
@@ -127,9 +128,10 @@ class Incremental:
             try:
                 self._rebuild()
             except Undetermined as error:
-                if keys.kind(error.key) != "l":
+                key = blamed(error.key, self._values)
+                if keys.kind(key) != "l":
                     raise
-                self._drop(error.key)
+                self._drop(key)
             else:
                 return
         self._rebuild()
@@ -239,8 +241,9 @@ class Incremental:
             with determined():
                 return self._values.retract(graph.linearize(self._values).optimize())
         except Undetermined as error:
-            if keys.kind(error.key) == "l":
-                raise
+            key = blamed(error.key, self._values, dropped)
+            if keys.kind(key) == "l":
+                raise Undetermined(key) from error
             self._restart()
             return gtsam.Values(self._values)
 
@@ -353,9 +356,10 @@ class Incremental:
                 with determined():
                     return gaussian_of(self._without(self._unheld.difference(wanted)), at, wanted)
             except Undetermined as error:
-                if keys.kind(error.key) != "l" or error.key in wanted:
+                key = blamed(error.key, at, self._unheld)
+                if keys.kind(key) != "l" or key in wanted:
                     raise
-                self._unheld.add(error.key)
+                self._unheld.add(key)
         with determined():
             return gaussian_of(self._without(self._unheld.difference(wanted)), at, wanted)
 

@@ -53,8 +53,6 @@ MANY = "lxq"
 class _Rest:
     """Parts of a result that need no other but the points."""
 
-    keyframes: dict[int, Float]
-    """Covariances (6, 6) of keyframes by stamp, ns, rotation first, body frame."""
     advice: dict[str, tuple[Advice, ...]]
     pick_views: tuple[PickView, ...]
 
@@ -113,8 +111,8 @@ class Summary:
             moved = motions(self._values, self._system, engine.odometry.keyframes_in(self._values))
             streaming = self._streaming_difference()
             remembered = memory()
+            path = (*self._past, *with_covariances(plain.trajectory, self._keyframe_covariances()))
             other = rest.awaited()
-            path = (*self._past, *with_covariances(plain.trajectory, other.keyframes))
         finally:
             rest.stop()
         return Result(
@@ -144,7 +142,6 @@ class Summary:
     def _rest(self, points: tuple[PointEstimate, ...]) -> "_Rest":
         """Half of the work, of what changes nothing and is told to nobody before the end."""
         return _Rest(
-            self._keyframe_covariances(),
             self._advice(points),
             pick_views(self._engine, self._values, self._system),
         )

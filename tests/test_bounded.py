@@ -13,6 +13,7 @@ from surecut.estimator.limits import Limits
 from surecut.estimator.marginal import FAMILY, carried, gaussian_of, joint_of, marginal, renamed, without
 from surecut.estimator.observability import Undetermined
 from surecut.estimator.points_in_base import point_blocks
+from surecut.estimator.run_away import run_away
 from surecut.estimator.surfaces import lay_on_surfaces
 from surecut.factors import keys
 from surecut.simulation.measurement_level import draw
@@ -241,3 +242,24 @@ def test_cut_is_of_what_there_is():
     solver.update(update)
     left = solver.reduce(Cut({points[0], keys.landmark(99)}, {keys.landmark(98)}, {keys.landmark(97)}), 0)
     assert set(left.keys()) == set(points[1:])
+
+
+def test_landmark_that_has_run_away_leaves_with_all_that_is_said_of_it(run):
+    """Where the images of a pair no longer differ nothing holds a landmark; its prior would cost all others theirs."""
+    whole, _ = estimated(run, Limits())
+    count = whole.odometry.last_keyframe + 1
+    engine, bounded = estimated(run, Limits(keyframes=2 * count // 3, step=count // 6, map_landmarks=20))
+    prior = next(f for _, f, r in engine.solver.log.active() if r.family == FAMILY)
+    mark = next(key for key in prior.keys() if keys.kind(key) == "l")
+    told, gone = len(engine.rejected), bounded.rebuilt
+    engine.state.values.update(mark, np.array([0.0, 0.0, 1e3]))
+    assert run_away(engine.state) == {mark}
+    bounded._forget(bounded.first + count // 6)
+    assert bounded.rebuilt == gone + 1
+    assert not engine.state.has(mark)
+    assert all(mark not in factor.keys() for _, factor, _ in engine.solver.log.active())
+    assert len(engine.rejected) == told + 1
+    expected, found = points_in_base(whole), points_in_base(engine)
+    for name, (position, covariance) in expected.items():
+        sigma = np.sqrt(np.diag(covariance))
+        assert np.abs(found[name][0] - position).max() < 0.3 * sigma.min(), name

@@ -24,6 +24,7 @@ from ..observability import Undetermined, determined
 from ..odometry import FAMILY as ODOMETRY
 from ..points_in_base import point_blocks
 from ..result import Consistency, FamilyConsistency
+from ..run_away import blamed
 from ..track_weights import track_weights
 
 Float = NDArray[np.float64]
@@ -53,14 +54,17 @@ def relinearised(log: FactorLog, values: gtsam.Values) -> tuple[gtsam.Values, se
         ObservabilityError: something else than a landmark is not determined.
     """
     off: set[int] = set()
+    marks: set[int] = set()
     while True:
         try:
             with determined():
                 return values.retract(without_factors(log, off).linearize(values).optimize()), off
         except Undetermined as error:
-            views = {i for i, f, r in log.active() if error.key in f.keys() and r.family != FAMILY}
-            if keys.kind(error.key) != "l" or views <= off:
+            key = blamed(error.key, values, marks)
+            views = {i for i, f, r in log.active() if key in f.keys() and r.family != FAMILY}
+            if keys.kind(key) != "l" or (key in marks and views <= off):
                 raise
+            marks.add(key)
             off |= views
 
 
