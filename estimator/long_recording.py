@@ -8,7 +8,7 @@ from .limits import Limits
 from .result import PoseEstimate
 from .trajectory import trajectory
 
-LIMITS = Limits(keyframes=160, step=40, map_landmarks=120, told=100_000, frames=1_000_000)
+LIMITS = Limits(keyframes=120, step=40, map_landmarks=120, told=100_000, frames=1_000_000)
 """Half a minute makes 30 to 65 keyframes. Refusals and frames of a whole day are kept."""
 
 
