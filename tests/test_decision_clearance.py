@@ -1,3 +1,5 @@
+"""Distances of the tool from what is beside the cut, against closed forms and samples."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,3 +1,5 @@
+"""The probability that a cut lies within its tolerance, against closed forms and Monte Carlo."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,3 +1,5 @@
+"""GO, NO-GO or MEASURE MORE: each rule by hand-made results."""
+
 import dataclasses
 
 import numpy as np

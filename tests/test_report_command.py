@@ -1,3 +1,5 @@
+"""`surecut report` as a user runs it: formats, several results, other plans, bad input."""
+
 import dataclasses
 import io
 import json

@@ -1,3 +1,5 @@
+"""What a report says and holds: structure, drawings, nothing from outside, the same bytes again."""
+
 import dataclasses
 import io
 import json

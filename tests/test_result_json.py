@@ -1,3 +1,5 @@
+"""Results as JSON: lossless, stable, with a hash that anyone can check."""
+
 import dataclasses
 import hashlib
 import json
