@@ -1,5 +1,7 @@
 """Does the model agree with its own data? Chi-square by family, and a test of every single prior and tape measure."""
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -7,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors.chance import chi2_cdf, chi2_ppf, normal_isf
+from ..factors.measurements import Rejection
 from .graph import Record
 from .linear import LinearSystem, deviate
 from .linearised import Linearised
@@ -20,6 +23,9 @@ FALSE_ALARM = 1e-3
 SIGMA_TOLERANCE = 0.25
 """Noise levels are known to a quarter: a family is inconsistent when its residuals need sigmas larger than that."""
 PRIOR_FALSE_ALARM = 1e-4
+CONTRADICTING, FEWEST_CONTRADICTING = 1 / 3, 4
+"""Share and number of a family's measurements beyond which those that were taken out as outliers are none: gross errors
+are the fewer by far, and where they are not nobody knows which ones were right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +86,33 @@ def prior_tests(
     return tests
 
 
-def judge(families: tuple[FamilyConsistency, ...], priors: list[PriorTest], paths: dict[str, float]) -> Consistency:
-    """The verdict with its reasons."""
-    reasons = []
+def contradictions(families: Iterable[FamilyConsistency], rejected: Iterable[Rejection]) -> list[str]:
+    """Families of which too much had to be taken out, in words: what is left agrees with itself because of that.
+
+    Args:
+        rejected: what the solution found to be outliers, as far as it had entered.
+    """
+    out = Counter(rejection.family for rejection in rejected)
+    told = []
+    for f in families:
+        gone, all_of_them = out[f.family], out[f.family] + f.residuals
+        if gone >= FEWEST_CONTRADICTING and gone > CONTRADICTING * all_of_them:
+            told.append(f"{f.family}: {gone} of {all_of_them} measurements contradict the rest (limit a third)")
+    return told
+
+
+def judge(
+    families: tuple[FamilyConsistency, ...],
+    priors: list[PriorTest],
+    paths: dict[str, float],
+    rejected: Iterable[Rejection] = (),
+) -> Consistency:
+    """The verdict with its reasons.
+
+    Args:
+        rejected: outliers of the solution, see `contradictions`.
+    """
+    reasons = contradictions(families, rejected)
     for f in families:
         if f.dof >= 1.0 and f.chi2 / f.dof > f.upper:
             factor = np.sqrt(f.chi2 / f.dof)

@@ -12,6 +12,7 @@ from ..factors.measurements import OutlineSighting, Pick, Rejection
 from ..frontends.pipe.pairs import OutlinePrior
 from ..frontends.pipe.predict import part_in_sight, predict_outline
 from ..frontends.pipe.silhouette import OutlineFinder, OutlineView, find_outlines
+from .axis_spread import AxisSpread, axis_spread
 from .engine import Engine
 from .pipe_widths import KeptView, PipeWidths
 from .pipes import AXIS_ROLES, INSET_SHARE
@@ -30,7 +31,10 @@ recording as in a stream, so that they answer alike: what is found later enters 
 OUTLINE_SPACING_M = 0.15
 """Views of a pipe nearer to each other than this tell nothing new."""
 AXIS_SIGMA_M, DIRECTION_SIGMA_RAD = 0.006, 0.02
-"""Sigmas with which the axis of a known pipe is looked for."""
+"""Sigmas with which the axis of a known pipe is looked for, at least."""
+UNSURE = 2.0
+"""Times these, across a view: there the pipe waits until more is known of it. Wrong edges would be found first, and
+lead to others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,12 @@ class OutlineSearch:
         """In those before them. They enter together, as if there had been no wait."""
         self._clicked = False
         """Is there a click that widths have not been measured with?"""
+        self._at_last = False
+        """Will nothing more be known of the pipes?"""
+        self._spreads: dict[str, AxisSpread] = {}
+        """How well axes are known at this look."""
+        self._sure: set[str] = set()
+        """Pipes whose axes are known better, from all sides, than they are looked for at best."""
         self._finders: dict[str, OutlineFinder] = {}
         self._widths = PipeWidths(engine)
         self._kept: deque[PairImages] = deque()
@@ -107,7 +117,7 @@ class OutlineSearch:
     def complete(self) -> None:
         """No more pictures will come: the widths with all that is known of the axes, and the edges by them."""
         self.go_on(to_the_end=True)
-        self._clicked = True
+        self._clicked = self._at_last = True
         self._look()
         self.go_on(to_the_end=True)
 
@@ -115,6 +125,7 @@ class OutlineSearch:
         """Measures widths, and chooses the views to look at."""
         pipes, anew = self._engine.pipes, self._clicked
         self._clicked = False
+        self._spreads.clear()
         for pipe in pipes.named():
             ends = pipes.known_part(pipe)
             if ends is not None:
@@ -136,6 +147,8 @@ class OutlineSearch:
             # What was found without knowing the width is looked for again.
             stamps = {pair.stamp_ns for pair in self._kept}
             self._widths.forget_outlines(pipe, stamps)
+            self._spreads.pop(pipe, None)
+            self._sure.discard(pipe)
             for camera in MOBILE:
                 looked = self._looked[pipe, camera]
                 looked.places = {s: place for s, place in looked.places.items() if s not in stamps}
@@ -185,9 +198,34 @@ class OutlineSearch:
             a, b = (o_T_c.transformTo(end) for end in ends)
             sigma = radius_sigma or unmeasured_sigma(radius, 0.5 * float(a[2] + b[2]), model.fx)
             prior = predict_outline(model, a, b, radius, AXIS_SIGMA_M, DIRECTION_SIGMA_RAD, sigma)
+            if prior is None:
+                continue
+            across = self._sigmas_across(pipe, o_T_c.translation(), ends)
+            if across is None:
+                continue
+            prior = predict_outline(model, a, b, radius, *across, sigma)
             if prior is not None:
                 looked.places[pair.stamp_ns] = o_T_c.translation()
                 self._ahead.append(_View(pipe, camera, pair, prior))
+
+    def _sigmas_across(self, pipe: str, camera: Float, part: tuple[Float, Float]) -> tuple[float, float] | None:
+        """Sigmas of an axis's place (m) and direction (rad) with which it is looked for; None where it had better wait.
+
+        Args:
+            camera: place of the camera in {o}.
+        """
+        least = AXIS_SIGMA_M, DIRECTION_SIGMA_RAD
+        if pipe in self._sure:
+            return least
+        if self._spreads.get(pipe) is None:
+            self._spreads[pipe] = axis_spread(self._engine, pipe)
+        spread = self._spreads[pipe]
+        if np.less(spread.worst(part), least).all():
+            self._sure.add(pipe)
+        across = spread.across(camera, part)
+        if not self._at_last and np.greater(across, UNSURE * np.array(least)).any():
+            return None
+        return max(across[0], least[0]), max(across[1], least[1])
 
     def _expected(self, pipe: str) -> tuple[tuple[Float, Float], float, float] | None:
         """Part of the axis, radius and the radius's sigma (0: not measured), with which outlines are looked for."""

@@ -325,7 +325,8 @@ class Summary:
         if told is not None and "mount_wrong" not in {event.kind for event in self._engine.events}:
             self._engine.events.append(told)
         moved = {f"{point} without {family}": sigma for (point, family), sigma in plain.without.items()}
-        return judge(plain.families, [*plain.priors, *cylinders], {**paths, **ways, **moved})
+        priors = [*plain.priors, *cylinders]
+        return judge(plain.families, priors, {**paths, **ways, **moved}, self._solution.rejected)
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""
