@@ -1,7 +1,7 @@
 """Does the model agree with its own data? Chi-square by family, and a test of every single prior and tape measure."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -101,18 +101,34 @@ def contradictions(families: Iterable[FamilyConsistency], rejected: Iterable[Rej
     return told
 
 
+def contradicted_points(clicks: Mapping[str, int], rejected: Iterable[Rejection]) -> list[str]:
+    """Points half of whose clicks were taken out, in words: the others may be the wrong ones.
+
+    Args:
+        clicks: how many there are, by point.
+        rejected: see `contradictions`.
+    """
+    what = [rejection.what for rejection in rejected]
+    out = {point: sum(text.startswith(f"pick {point} in ") for text in what) for point in clicks}
+    return [
+        f"{point}: {out[point]} of {number} clicks contradict the rest (limit half)"
+        for point, number in clicks.items()
+        if out[point] and 2 * out[point] >= number
+    ]
+
+
 def judge(
     families: tuple[FamilyConsistency, ...],
     priors: list[PriorTest],
     paths: dict[str, float],
-    rejected: Iterable[Rejection] = (),
+    contradicted: Iterable[str] = (),
 ) -> Consistency:
     """The verdict with its reasons.
 
     Args:
-        rejected: outliers of the solution, see `contradictions`.
+        contradicted: reasons found before, see `contradictions` and `contradicted_points`.
     """
-    reasons = contradictions(families, rejected)
+    reasons = [*contradicted]
     for f in families:
         if f.dof >= 1.0 and f.chi2 / f.dof > f.upper:
             factor = np.sqrt(f.chi2 / f.dof)

@@ -147,16 +147,28 @@ class Incremental:
             self.log.replace(index, factor)
         self._relocated = True
 
-    def _erase(self, landmarks: set[int]) -> None:
-        for index, factor, record in [row for row in self.log.active() if not landmarks.isdisjoint(row[1].keys())]:
+    def give_up(self, gone: Collection[int], places: Mapping[int, Float]) -> gtsam.Values:
+        """Takes variables out with all of their factors, and begins anew at the next update with points elsewhere.
+
+        Args:
+            places: of points, shape (3,), by key.
+        """
+        self._erase({key for key in gone if self._values.exists(key)})
+        for key, place in places.items():
+            self._values.update(key, np.asarray(place, np.float64))
+        self._relocated = True
+        return gtsam.Values(self._values)
+
+    def _erase(self, gone: set[int]) -> None:
+        for index, factor, record in [row for row in self.log.active() if not gone.isdisjoint(row[1].keys())]:
             prior = joint_of(factor, self._values) if record.family == FAMILY else None
-            rest = None if prior is None else without(prior, landmarks)
+            rest = None if prior is None else without(prior, gone)
             if rest is None:
                 self.log.off.add(index)
             else:  # what is known of everything else does not go with it
                 self.log.replace(index, rest.factor())
-        for landmark in landmarks:
-            self._values.erase(landmark)
+        for key in gone:
+            self._values.erase(key)
 
     def _rebuild(self) -> None:
         """Starts iSAM2 anew from a damped batch optimum.

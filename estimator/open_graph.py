@@ -1,6 +1,6 @@
 """The graph while it grows: what is believed, what waits for the solver, and the solver."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -45,6 +45,14 @@ class OpenGraph:
             values: with `correction` from the left on the variables `moved`.
         """
         self.state.values = self.solver.relocate(values, moved, correction)
+
+    def give_up(self, gone: Collection[int], places: Mapping[int, NDArray[np.float64]]) -> None:
+        """Variables leave with all that was said of them, and points begin again elsewhere; nothing may be waiting.
+
+        Args:
+            places: in {o}, shape (3,), by key.
+        """
+        self.state.values = self.solver.give_up(gone, places)
 
     def joint_covariance(self, keys: Sequence[int]) -> NDArray[np.float64]:
         """Joint covariance of some variables with all that has gathered, in the order of `keys`.

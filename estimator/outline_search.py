@@ -14,6 +14,7 @@ from ..frontends.pipe.predict import part_in_sight, predict_outline
 from ..frontends.pipe.silhouette import OutlineFinder, OutlineView, find_outlines
 from .axis_spread import AxisSpread, axis_spread
 from .engine import Engine
+from .pipe_restart import begin_anew, clicked_places
 from .pipe_widths import KeptView, PipeWidths
 from .pipes import AXIS_ROLES, INSET_SHARE
 from .sensors import PairImages
@@ -90,6 +91,8 @@ class OutlineSearch:
         while self._kept_bytes > KEPT_BYTES or self._kept[0].stamp_ns not in self._engine.keyframe_at:
             self._kept_bytes -= self._kept.popleft().nbytes
         clicked = [pick for pick in picks if pick.role in AXIS_ROLES and pick.camera in MOBILE]
+        if clicked:
+            self._begin_anew_where_astray()
         for pick in clicked:
             if self._widths.of(self._engine.pipes.pipe_of(pick.point_id)) is None:
                 self._about(pick, pair)
@@ -117,9 +120,33 @@ class OutlineSearch:
     def complete(self) -> None:
         """No more pictures will come: the widths with all that is known of the axes, and the edges by them."""
         self.go_on(to_the_end=True)
+        self._begin_anew_where_astray()
         self._clicked = self._at_last = True
         self._look()
         self.go_on(to_the_end=True)
+
+    def _begin_anew_where_astray(self) -> None:
+        """Pipes that clicks show elsewhere: what was found about them was something else."""
+        engine = self._engine
+        for pipe in [pipe for pipe, cylinder in engine.pipes.cylinders.items() if cylinder.known]:
+            engine.flush()
+            places = clicked_places(engine, pipe)
+            if not places:
+                continue
+            begin_anew(engine, pipe, places)
+            self._ahead = deque(view for view in self._ahead if view.pipe != pipe)
+            self._found = [one for one in self._found if isinstance(one, Rejection) or one.pipe_id != pipe]
+            self._widths.forget(pipe)
+            self._spreads.pop(pipe, None)
+            self._sure.discard(pipe)
+            for camera in MOBILE:
+                self._looked[pipe, camera] = _Apart()
+                self._shown[pipe, camera] = _Apart()
+            pairs = {pair.stamp_ns: pair for pair in self._kept}
+            for _, pick in engine.pipes.clicked:
+                if pick.stamp_ns in pairs and pick.camera in MOBILE and engine.pipes.pipe_of(pick.point_id) == pipe:
+                    self._about(pick, pairs[pick.stamp_ns])
+            engine.flush()
 
     def _look(self) -> None:
         """Measures widths, and chooses the views to look at."""

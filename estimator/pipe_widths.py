@@ -83,6 +83,11 @@ class PipeWidths:
         camera = self._engine.cameras[kept.camera]
         return PipeView(kept.pair.of(kept.camera), camera, a, b, where.o_T_c.rotation().matrix())
 
+    def forget(self, pipe: str) -> None:
+        """It has left the graph: its width is measured anew."""
+        for known in (self._found, self._views, self._entered):
+            known.pop(pipe, None)
+
     def enter(self, pipe: str) -> None:
         """The present width into the graph, in the place of an earlier one."""
         found = self._found.get(pipe)

@@ -99,7 +99,7 @@ class Pipes:
 
     def _start(self, point: PipePoint, depth_m: tuple[float, float] | None) -> Float | None:
         """Where the point begins: from two rays with parallax, or from a measured depth."""
-        rays = [self._ray(where, pick.camera, pick.px) for where, pick in point.held]
+        rays = [self.ray(where, pick.camera, pick.px) for where, pick in point.held]
         place = intersection(rays)
         if place is not None:
             return place
@@ -110,7 +110,8 @@ class Pipes:
         forward = point.held[-1][0].o_T_c.rotation().matrix()[:, 2]
         return origin + direction * ((depth_m[0] + radius) / float(direction @ forward))
 
-    def _ray(self, where: SeenFrom, camera: str, px: Float) -> tuple[Float, Float]:
+    def ray(self, where: SeenFrom, camera: str, px: Float) -> tuple[Float, Float]:
+        """Origin and direction in {o} of what is seen at a pixel."""
         K = self._state.intrinsics(keys.intrinsics(camera)).K()
         direction = where.o_T_c.rotation().matrix() @ np.linalg.solve(K, np.array([px[0], px[1], 1.0]))
         return where.o_T_c.translation(), direction / np.linalg.norm(direction)
@@ -342,6 +343,16 @@ class Pipes:
         before = len(self.outlined)
         self.outlined = [p for p in self.outlined if not (p[1].pipe_id == pipe_id and p[1].stamp_ns in stamps)]
         self.cylinders[pipe_id].outlines -= before - len(self.outlined)
+
+    def begin_anew(self, pipe_id: str) -> None:
+        """Axis and outlines have left the graph; its points and their clicks are there still."""
+        cylinder = self.cylinders[pipe_id]
+        cylinder.known, cylinder.outlines = False, 0
+        cylinder.held.clear()
+        self.outlined = [(where, seen) for where, seen in self.outlined if seen.pipe_id != pipe_id]
+        for point in self.points.values():
+            if point.pipe == pipe_id:
+                point.on_axis = False
 
     def named(self) -> list[str]:
         """Pipes that something is known of."""

@@ -21,7 +21,7 @@ from .aside import Aside
 from .batch import BatchSolution
 from .board_inspection import FAMILY as CORNERS
 from .calibration_rows import calibration_rows
-from .consistency import judge
+from .consistency import contradicted_points, contradictions, judge
 from .engine import Engine
 from .known_distances import distance_name
 from .marker_points import parse_point
@@ -326,7 +326,9 @@ class Summary:
             self._engine.events.append(told)
         moved = {f"{point} without {family}": sigma for (point, family), sigma in plain.without.items()}
         priors = [*plain.priors, *cylinders]
-        return judge(plain.families, priors, {**paths, **ways, **moved}, self._solution.rejected)
+        out, clicks = self._solution.rejected, {p.id: p.picks for p in self._engine.pipes.points.values()}
+        contradicted = [*contradictions(plain.families, out), *contradicted_points(clicks, out)]
+        return judge(plain.families, priors, {**paths, **ways, **moved}, contradicted)
 
     def _streaming_difference(self) -> dict[str, float]:
         """iSAM2 against the batch optimum over the same factors, in sigmas, worst by kind of variable."""

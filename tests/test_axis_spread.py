@@ -1,4 +1,4 @@
-"""How well an axis is known across a view, and families that had to be taken apart: closed forms."""
+"""How well an axis is known across a view: closed forms."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from surecut.estimator.axis_spread import AxisSpread
-from surecut.estimator.consistency import CONTRADICTING, FEWEST_CONTRADICTING, judge
-from surecut.estimator.result import FamilyConsistency
-from surecut.factors.measurements import Rejection
 
 START, END = np.array([0.0, -0.25, 1.0]), np.array([0.0, 0.25, 1.0])
 PART = START + np.array([0.0, 0.1, 0.0]), END - np.array([0.0, 0.1, 0.0])
@@ -47,26 +44,3 @@ def test_no_side_is_worse_than_the_worst(seed):
     part = spread.start, spread.end
     across, worst = spread.across(rng.normal(size=3), part), spread.worst(part)
     assert np.less_equal(across, np.array(worst) * (1 + 1e-9)).all()
-
-
-def family(residuals: int) -> FamilyConsistency:
-    return FamilyConsistency("pipe outline", float(residuals), float(residuals), 0.1, 3.0, residuals, 0)
-
-
-def rejected(number: int) -> list[Rejection]:
-    return [Rejection(i, "pipe outline", f"edge {i}", "whitened residual", 9.0, 4.9) for i in range(number)]
-
-
-def test_a_family_of_which_half_contradicts_the_rest_is_not_consistent():
-    """What is left agrees with itself, because the rest was taken out."""
-    verdict = judge((family(10),), [], {}, rejected(10))
-    assert not verdict.passed
-    assert verdict.reasons == ("pipe outline: 10 of 20 measurements contradict the rest (limit a third)",)
-
-
-def test_a_few_gross_errors_are_outliers():
-    assert judge((family(10),), [], {}, rejected(5)).passed
-    assert 6 / 16 > CONTRADICTING
-    assert not judge((family(10),), [], {}, rejected(6)).passed
-    assert judge((family(1),), [], {}, rejected(FEWEST_CONTRADICTING - 1)).passed
-    assert judge((family(10),), [], {}, [Rejection(0, "picks", "P1", "whitened residual", 9.0, 4.9)] * 9).passed
