@@ -1,8 +1,8 @@
 """A pipe that was begun in the wrong place begins anew.
 
 One click has a depth by stereo matching, which may be that of something behind the pipe. The axis then begins metres
-away or along the line of sight, from where no step leads back: robust losses let go of the clicks that would. Clicks from
-several places tell where it is, without axis and outlines.
+away or along the line of sight, from where no step leads back: robust losses let go of the clicks that would. Clicks
+from several places tell where it is, without axis and outlines.
 """
 
 from collections.abc import Mapping
