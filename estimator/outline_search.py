@@ -91,10 +91,10 @@ class OutlineSearch:
         while self._kept_bytes > KEPT_BYTES or self._kept[0].stamp_ns not in self._engine.keyframe_at:
             self._kept_bytes -= self._kept.popleft().nbytes
         clicked = [pick for pick in picks if pick.role in AXIS_ROLES and pick.camera in MOBILE]
-        if clicked:
-            self._begin_anew_where_astray()
+        anew = self._begin_anew_where_astray() if clicked else set()
         for pick in clicked:
-            if self._widths.of(self._engine.pipes.pipe_of(pick.point_id)) is None:
+            pipe = self._engine.pipes.pipe_of(pick.point_id)
+            if pipe not in anew and self._widths.of(pipe) is None:
                 self._about(pick, pair)
         if clicked:
             self._engine.flush()
@@ -125,28 +125,39 @@ class OutlineSearch:
         self._look()
         self.go_on(to_the_end=True)
 
-    def _begin_anew_where_astray(self) -> None:
-        """Pipes that clicks show elsewhere: what was found about them was something else."""
-        engine = self._engine
+    def _begin_anew_where_astray(self) -> set[str]:
+        """Pipes that clicks show elsewhere: what was found about them was something else. All their clicks are looked at
+        again, this picture's too.
+
+        Returns:
+            Which ones.
+        """
+        engine, anew = self._engine, set[str]()
         for pipe in [pipe for pipe, cylinder in engine.pipes.cylinders.items() if cylinder.known]:
             engine.flush()
             places = clicked_places(engine, pipe)
             if not places:
                 continue
+            anew.add(pipe)
             begin_anew(engine, pipe, places)
-            self._ahead = deque(view for view in self._ahead if view.pipe != pipe)
-            self._found = [one for one in self._found if isinstance(one, Rejection) or one.pipe_id != pipe]
-            self._widths.forget(pipe)
-            self._spreads.pop(pipe, None)
-            self._sure.discard(pipe)
-            for camera in MOBILE:
-                self._looked[pipe, camera] = _Apart()
-                self._shown[pipe, camera] = _Apart()
+            self._forget(pipe)
             pairs = {pair.stamp_ns: pair for pair in self._kept}
             for _, pick in engine.pipes.clicked:
                 if pick.stamp_ns in pairs and pick.camera in MOBILE and engine.pipes.pipe_of(pick.point_id) == pipe:
                     self._about(pick, pairs[pick.stamp_ns])
             engine.flush()
+        return anew
+
+    def _forget(self, pipe: str) -> None:
+        """All that has been found and chosen about a pipe."""
+        self._ahead = deque(view for view in self._ahead if view.pipe != pipe)
+        self._found = [one for one in self._found if isinstance(one, Rejection) or one.pipe_id != pipe]
+        self._widths.forget(pipe)
+        self._spreads.pop(pipe, None)
+        self._sure.discard(pipe)
+        for camera in MOBILE:
+            self._looked[pipe, camera] = _Apart()
+            self._shown[pipe, camera] = _Apart()
 
     def _look(self) -> None:
         """Measures widths, and chooses the views to look at."""
