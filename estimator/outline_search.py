@@ -126,8 +126,8 @@ class OutlineSearch:
         self.go_on(to_the_end=True)
 
     def _begin_anew_where_astray(self) -> set[str]:
-        """Pipes that clicks show elsewhere: what was found about them was something else. All their clicks are looked at
-        again, this picture's too.
+        """Pipes that clicks show elsewhere: what was found about them was something else. All their clicks are looked
+        at again, this picture's too.
 
         Returns:
             Which ones.
