@@ -51,14 +51,12 @@ class AxisSpread:
         return place @ self.covariance @ place.T, turn @ self.covariance @ turn.T
 
 
-def axis_spread(engine: Engine, pipe: str) -> AxisSpread:
-    """By the joint of all that is in the graph; with nothing where there is no axis yet, or it is not determined."""
-    axis = engine.pipes.axis(pipe)
-    if axis is None:
-        return AxisSpread(np.zeros(3), np.ones(3), np.zeros((6, 6)))
+def axis_spread(engine: Engine, pipe: str) -> AxisSpread | None:
+    """Of a pipe that has an axis, by the joint of all that is in the graph; None where that does not determine it."""
     index = engine.pipes.cylinders[pipe].index
+    start, end = keys.axis_start(index), keys.axis_end(index)
     try:
-        covariance = engine.graph.joint_covariance([keys.axis_start(index), keys.axis_end(index)])
+        covariance = engine.graph.joint_covariance([start, end])
     except ObservabilityError:
-        covariance = np.zeros((6, 6))
-    return AxisSpread(axis[0], axis[1], covariance)
+        return None
+    return AxisSpread(engine.state.point(start), engine.state.point(end), covariance)

@@ -148,7 +148,7 @@ class Bounded:
         if lonely:
             stamp = self.engine.end_ns
             text = f"views of {len(lonely)} landmarks"
-            reason = "too few good views of the landmark; views"
+            reason = "landmarks with too few good views, or beyond what a pair can tell; views"
             self.engine.rejected.append(Rejection(stamp, "stereo odometry", text, reason, 1.0, MINIMUM_VIEWS))
 
     def _shorten(self) -> None:

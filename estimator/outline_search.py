@@ -71,8 +71,8 @@ class OutlineSearch:
         """Is there a click that widths have not been measured with?"""
         self._at_last = False
         """Will nothing more be known of the pipes?"""
-        self._spreads: dict[str, AxisSpread] = {}
-        """How well axes are known at this look."""
+        self._spreads: dict[str, AxisSpread | None] = {}
+        """How well axes are known at this look; None: not determined."""
         self._sure: set[str] = set()
         """Pipes whose axes are known better, from all sides, than they are looked for at best."""
         self._finders: dict[str, OutlineFinder] = {}
@@ -253,11 +253,13 @@ class OutlineSearch:
             camera: place of the camera in {o}.
         """
         least = AXIS_SIGMA_M, DIRECTION_SIGMA_RAD
-        if pipe in self._sure:
+        if pipe in self._sure or self._engine.pipes.axis(pipe) is None:  # then two clicks and a width place it
             return least
-        if self._spreads.get(pipe) is None:
+        if pipe not in self._spreads:
             self._spreads[pipe] = axis_spread(self._engine, pipe)
         spread = self._spreads[pipe]
+        if spread is None:
+            return None
         if np.less(spread.worst(part), least).all():
             self._sure.add(pipe)
         across = spread.across(camera, part)

@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..factors import keys
-from ..factors.measurements import Event, Pick
+from ..factors.measurements import Event, Pick, Rejection
 from ..factors.noise import floored
 from .depth_pipes import FAMILY as CYLINDER
 from .engine import Engine
 from .marginal import FAMILY as EARLIER
 from .pipe_parts import SeenFrom, intersection
-from .pipes import AXIS_ROLES
+from .pipes import AXIS_ROLES, OUTLINE
 
 Float = NDArray[np.float64]
 
@@ -32,8 +32,7 @@ def clicked_places(engine: Engine, pipe: str) -> dict[int, Float]:
     Returns:
         Places in {o}, shape (3,), by index of the point; nothing where the axis is right, or where clicks do not tell.
     """
-    axis = engine.pipes.axis(pipe)
-    if axis is None or _known_otherwise(engine, pipe):
+    if engine.pipes.axis(pipe) is None or _known_otherwise(engine, pipe):
         return {}
     places, astray = {}, False
     for point in engine.pipes.points.values():
@@ -44,14 +43,19 @@ def clicked_places(engine: Engine, pipe: str) -> dict[int, Float]:
         if place is None or max(_off(engine, where, pick, place) for where, pick in views) > AGREE:
             continue
         places[point.index] = place
-        along = axis[1] - axis[0]
-        nearest = axis[0] + along * float((place - axis[0]) @ along) / float(along @ along)
-        astray |= max(_off(engine, where, pick, nearest) for where, pick in views) > ASTRAY
+        astray |= _passed_by(engine, pipe, point.id, place) > ASTRAY
     return places if astray else {}
 
 
 def begin_anew(engine: Engine, pipe: str, places: Mapping[int, Float]) -> None:
     """Takes axis, radius and outlines of a pipe out of the graph, and puts its points where their clicks are."""
+    points = {point.index: point.id for point in engine.pipes.points.values()}
+    off = max(_passed_by(engine, pipe, points[i], place) for i, place in places.items())
+    reason = "found about an axis that passes the clicks, sigmas of a click"
+    engine.rejected += [
+        Rejection(seen.stamp_ns, OUTLINE, f"outline of {pipe} in {seen.camera}", reason, off, ASTRAY)
+        for _, seen in engine.pipes.outlined_of(pipe)
+    ]
     index = engine.pipes.cylinders[pipe].index
     gone = {keys.axis_start(index), keys.axis_end(index), keys.radius(index), keys.inset(index)}
     engine.graph.give_up(gone, {keys.point(i): place for i, place in places.items()})
@@ -59,6 +63,14 @@ def begin_anew(engine: Engine, pipe: str, places: Mapping[int, Float]) -> None:
     engine.pipes.begin_anew(pipe)
     text = f"clicks on {pipe} from several places agree with each other, and not with where it had begun; it began anew"
     engine.events.append(Event(engine.end_ns, "pipe_begun_anew", text, "info"))
+
+
+def _passed_by(engine: Engine, pipe: str, point_id: str, place: Float) -> float:
+    """How far a pipe's axis passes the clicks on a point, where it is nearest to the point's place, in their sigmas."""
+    start, end, _ = engine.pipes.axis(pipe) or (place, place, 0.0)
+    along = end - start
+    nearest = start + along * float((place - start) @ along) / max(float(along @ along), 1e-12)
+    return max(_off(engine, where, pick, nearest) for where, pick in _views(engine, point_id))
 
 
 def _views(engine: Engine, point_id: str) -> list[tuple[SeenFrom, Pick]]:

@@ -60,6 +60,9 @@ def test_clicks_find_a_pipe_that_is_elsewhere(engine):
     assert not any(AXIS & set(factor.keys()) for _, factor, _ in engine.solver.log.active())
     assert not any(engine.state.has(key) for key in AXIS)
     assert [event.kind for event in engine.events].count("pipe_begun_anew") == 1
+    told = [r for r in engine.rejected if r.family == OUTLINE and "passes the clicks" in r.reason]
+    assert [r.stamp_ns for r in told] == [seen.stamp_ns for seen in outlines]
+    assert all(r.value > r.limit for r in told)
 
     for seen in outlines:
         engine.add_outline(seen)
